@@ -11,9 +11,9 @@ from tests.support.documents import BENCHMARK, README, tables
 from tests.support.real_voice import real_voice
 from tests.support.sink import PROGRAMS
 from tests.support.surroundings import needs, needs_packages
-from tests.tools.bench import heard, load, marathon
+from tests.tools.bench import load, marathon, sound
 from tests.tools.bench.__main__ import GROUPS, NAMED, measure
-from tests.tools.bench.stage import TALK, Options, Stage
+from tests.tools.bench.harness import TALK, Harness, Options
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -27,15 +27,15 @@ def without_numbers(name: str, goal: str) -> tuple[str, str]:
 
 
 @pytest.fixture(scope="module")
-def stage() -> Iterator[Stage]:
+def harness() -> Iterator[Harness]:
     needs(TALK, *PROGRAMS)
-    with Stage(Options(rounds=1, idle=1, sentences=2)) as result:
+    with Harness(Options(rounds=1, idle=1, sentences=2)) as result:
         yield result
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("group", [*GROUPS, *NAMED])
-def test_every_row_of_a_group_measures_something(stage: Stage, group: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_row_of_a_group_measures_something(harness: Harness, group: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if group == "neural":
         real_voice()
     if group == "fleet":
@@ -43,10 +43,10 @@ def test_every_row_of_a_group_measures_something(stage: Stage, group: str, monke
         needs_packages("paho")
     for module, name, smaller in (
         *((load, "GOALS", 200), (load, "FEW", 250), (load, "MANY", 300), (load, "PENDING", 300), (load, "CLIENTS", 20)),
-        *((heard, "LONG_TEXT", heard.LONG_TEXT[:50]), (heard, "_TEXTS", 1), (marathon, "SERVERS", 1)),
+        *((sound, "LONG_TEXT", sound.LONG_TEXT[:50]), (sound, "_TEXTS", 1), (marathon, "SERVERS", 1)),
     ):
         monkeypatch.setattr(module, name, smaller)
-    rows = measure(group, stage)
+    rows = measure(group, harness)
     assert [row.failure for row in rows if row.failure] == []
     assert all(len(row.cells()) == len(TABLES[0][0]) and row.values for row in rows)
     if group not in ("neural", "marathon"):  # no table shows these

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from tests.support.usage import descendants
-from tests.tools.bench.machine import taken_in
+from tests.tools.bench.machine import measure_use
 
 if TYPE_CHECKING:
     from tests.conftest import MakeTalk
@@ -18,5 +18,5 @@ def test_an_idle_server_switches_context_at_most_once_a_second(make_talk: MakeTa
     assert talk.run("say", "--wait", "--", "ready").code == 0
     processes = [talk.pid, *descendants(talk.pid)]
     assert len(processes) == 2, "the server, and its engine process"
-    usage = taken_in(processes, MEASURED_S)
+    usage = measure_use(processes, MEASURED_S)
     assert usage.switches <= MEASURED_S, usage

@@ -19,7 +19,7 @@ from talkcli.engine import protocol
 from tests.engine.process import Engine
 from tests.faults.test_text_bad import ENDLESS, LONGEST_WORDS, MARKUP, RIGHT_TO_LEFT
 from tests.support.real_voice import REAL_VOICE
-from tests.tools.fuzz_texts import made
+from tests.tools.fuzz_texts import random_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -111,7 +111,7 @@ def _assert_no_faults(tally: Tally, texts: int) -> None:
 
 def test_each_odd_text_ends_once(tmp_path: Path, real_voice_env: dict[str, str]) -> None:
     source = random.Random(SEED)
-    texts = [text[:25] for text in (*ODD[::5], *(made(source) for _ in range(FEW)))]
+    texts = [text[:25] for text in (*ODD[::5], *(random_text(source) for _ in range(FEW)))]
     _assert_no_faults(_speak_all(texts, tmp_path, real_voice_env), len(texts))
 
 
@@ -120,7 +120,7 @@ def test_each_odd_text_ends_once(tmp_path: Path, real_voice_env: dict[str, str])
 @pytest.mark.parametrize("part", range(PARTS))
 def test_each_of_many_odd_texts_ends_once(tmp_path: Path, real_voice_env: dict[str, str], part: int) -> None:
     source = random.Random(SEED)
-    texts = [*ODD, *(made(source)[:LONGEST] for _ in range(MANY - len(ODD)))][part::PARTS]
+    texts = [*ODD, *(random_text(source)[:LONGEST] for _ in range(MANY - len(ODD)))][part::PARTS]
     _assert_no_faults(_speak_all(texts, tmp_path, real_voice_env), len(texts))
 
 

@@ -24,7 +24,7 @@ from tests.support import processes, usage
 from tests.support.connection import Wire
 from tests.support.processes import children
 from tests.support.timing import assert_within, limits
-from tests.tools.witness import Witness
+from tests.tools.goal_monitor import GoalMonitor
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -383,7 +383,7 @@ AHEAD = 50
 @pytest.mark.parametrize("goals", [500, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_a_cancel_racing_with_the_end_gives_exactly_one_end_state(make_talk: MakeTalk, goals: int) -> None:
     talk = make_talk(scripted=True, watched=False)
-    witness = Witness(talk.socket)
+    witness = GoalMonitor(talk.socket)
     over = threading.Event()
 
     def cancel() -> None:
