@@ -150,7 +150,7 @@ def refusal(code: str, message: str, items: list[dict[str, object]] | None = Non
 
 
 def memory_limits() -> str:
-    """Return a text that names the memory limit of this process, or says what to check if there is none."""
+    """Return a message that names the memory limit of this process, or that says what to check if there is none."""
     import resource  # rarely needed, and slow to import
 
     # Each memory limit, its unit, and the shell command and systemd option that change it.

@@ -34,7 +34,7 @@ def named_socket(option: str | None) -> str | None:
 
 
 def named_robot(option: str | None, socket: str | None) -> str | None:
-    """Return the value of --robot, or of TALK_ROBOT if --socket isn't given either, or None if there is none.
+    """Return the robot named by --robot or by TALK_ROBOT, or None. TALK_ROBOT is ignored if --socket is given.
 
     Both options take precedence over the variables, and TALK_ROBOT over TALK_SOCKET.
     """
@@ -42,7 +42,7 @@ def named_robot(option: str | None, socket: str | None) -> str | None:
 
 
 def client_sockets(named: str | None) -> list[str]:
-    """Return the socket paths for a client to try, in order: only `named` if it is given, or the usual ones."""
+    """Return the socket paths that a client tries, in order. If `named` is given, it is the only one."""
     if named:
         return [named]
     directories = [os.environ.get("XDG_RUNTIME_DIR"), *_runtime_directories(os.getuid())]

@@ -39,7 +39,7 @@ def is_held(pipe: int, seconds: float = 0.0) -> bool:
     """Wait up to `seconds` for the other end of the pipe to close, and return whether it is still open."""
     # Don't use `wait_ready` here. A player may be killed while the interpreter exits, when modules can't be imported.
     poll = select.poll()
-    poll.register(pipe, 0)  # Linux always reports a closed end
+    poll.register(pipe, 0)  # Linux reports that the other end was closed even if no events are requested
     return not poll.poll(seconds * 1000)
 
 

@@ -47,7 +47,7 @@ def cancel(options: CommonOptions, ids: tuple[str, ...], current: bool, before: 
 
 
 def status(options: CommonOptions, goal_id: str | None, long: bool) -> None:
-    """Show the status of the server or, if an id is given, the details of this goal."""
+    """Show the server's status, or the details of a goal if an id is given."""
     from talkcli.goals.goal import Goal
     from talkcli.terminal.goals import goal_lines, status_lines
 
@@ -169,7 +169,7 @@ def doctor(options: CommonOptions, silent: bool) -> int:
 def _create_examination(
     options: CommonOptions, interrupt: Mapping[int, int], *, silent: bool
 ) -> examine.LocalExamination | broker.BrokerExamination:
-    """Return an object that checks this machine or, if a robot is selected, the connection to it."""
+    """Return an object that checks this machine, or the connection to the selected robot."""
     robot = named_robot(options.robot, options.socket)
     if robot is None:
         from talkcli.doctor.examine import LocalExamination

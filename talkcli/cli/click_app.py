@@ -164,7 +164,7 @@ class _HelpfulCommand(click.Command):
     def write_options(
         self, heading: str, parameters: Iterable[click.Parameter], ctx: click.Context, formatter: click.HelpFormatter
     ) -> None:
-        """Write the help of some options, if there are any."""
+        """Write the help texts of these options, if there are any."""
         records = [each.get_help_record(ctx) for each in parameters if isinstance(each, click.Option)]
         if records:
             with formatter.section(heading):

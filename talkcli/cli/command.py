@@ -260,7 +260,7 @@ def _format_byte(character: str) -> str:
 
 
 def replace_bad_bytes(text: str, first_line: int = 1) -> tuple[str, str | None]:
-    """Return a text with invalid UTF-8 replaced by U+FFFD, and a message about it, or None if there was none.
+    """Replace invalid UTF-8 in a text by U+FFFD, and return the text with a message, or with None if it was valid.
 
     Args:
         text: the text, with invalid bytes decoded to surrogates.

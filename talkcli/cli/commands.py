@@ -57,7 +57,7 @@ _OTHER_EXTENSIONS = (".aac", ".aiff", ".au", ".flac", ".m4a", ".mp3", ".mp4", ".
 
 
 def _say_fault(given: Mapping[str, Any], typed: frozenset[str]) -> str | None:
-    """Return why these options of `say` can't be combined, as an error message, or None if they can."""
+    """Return an error message if these options of `say` can't be combined, otherwise None."""
     output, text, waits = given["output"], given["text"], given["wait"] or given["feedback"]
     if output is not None:
         named = [long_flag(each, given[each.name]) for each in _SAY_OPTIONS if each.name in typed - _SERVERLESS_OPTIONS]
@@ -138,7 +138,7 @@ _SERVE_OPTIONS = (
 
 
 def _serve_fault(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
-    """Return why these options of `serve` can't be combined, as an error message, or None if they can."""
+    """Return an error message if these options of `serve` can't be combined, otherwise None."""
     player = given["player"] or ""
     if given["device"] and player.startswith(("null", "file:")):
         return f"the player {player} has no devices; leave out --device"
@@ -472,8 +472,8 @@ _ROWS = (
         description="""
         Print the completion script for bash, zsh or fish, to be loaded by the shell's start file.
 
-        Tab then completes commands, options and their values. If a server runs, Tab also completes goal ids, keys and
-        voices.
+        Tab then completes commands, options and their values. While a server runs, Tab also completes goal ids, keys
+        and voices.
         """,
         function="completion:completion",
         uses_server=False,

@@ -74,7 +74,7 @@ def _completion_lines(talk: click.Command, options: CommonOptions) -> list[str]:
 
 
 def _format_for_bash(word: str, value: str, _: str | None) -> str:
-    """Format a value for bash as its script expects it: quoted, and without the part that bash keeps.
+    """Quote a value for bash's completion script, and remove the part that bash keeps.
 
     bash replaces the text in COMP_CWORD, which may be only the last part of the word.
     """

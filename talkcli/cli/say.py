@@ -101,7 +101,7 @@ def _read_input(
 
 
 def replace_and_report_bad_bytes(text: str, options: CommonOptions) -> str:
-    """Return a text with invalid UTF-8 replaced, and print a message about that unless --quiet is given."""
+    """Replace invalid UTF-8 in a text, and return it. Print a message about the change unless --quiet is given."""
     text, problem = replace_bad_bytes(text)
     if problem and not options.quiet:
         note(problem)

@@ -112,7 +112,7 @@ class CommonOptions:
         return from_environment(os.environ, insecure=self.insecure)
 
     def _open_connection(self, **options: Any) -> Connection:
-        """Open a connection to the robot, or to the server of this machine if no robot is selected."""
+        """Connect to the selected robot, or to the server on this machine if no robot is selected."""
         robot = paths.named_robot(self.robot, self.socket)
         if not robot:
             from talkcli.client.connection import SocketConnection

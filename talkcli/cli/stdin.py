@@ -58,7 +58,7 @@ class InputTooLong(UsageError):
 
 
 def read_text(end: float | None, *, stop_without_reader: bool = False, any_length: bool = False) -> str | int:
-    """Read standard input as one text. Return it, or the exit code if a signal or closed output ends the reading.
+    """Return all of standard input as one text, or an exit code if a signal or closed output ended the reading.
 
     Args:
         end: the monotonic time by which the input must have ended, or None for no limit.

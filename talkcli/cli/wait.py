@@ -29,7 +29,7 @@ CANCEL_TIMEOUT_S = 1.0
 
 
 def seconds_left(end: float | None) -> float | None:
-    """Return the number of seconds until a monotonic time, at least 0, or None if there is no limit."""
+    """Return how many seconds are left until a monotonic time, or None if there is no time limit."""
     return None if end is None else max(0.0, end - time.monotonic())
 
 

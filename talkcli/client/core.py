@@ -241,7 +241,7 @@ class TrackedGoal:
         return self.goal.state.terminal or bool(self._buffer)
 
     def _take(self) -> Event | None:
-        """Remove and return the oldest event, or else the Result of an ended goal, or None."""
+        """Remove and return the oldest event, and the Result after the last one. Return None if nothing is new."""
         return self._buffer.take() or (Result(self.goal) if self.goal.state.terminal else None)
 
 
@@ -369,7 +369,7 @@ class ClientCore:
         self.exchanges[exchange.number] = exchange
 
     def line(self, exchange: Exchange) -> bytes:
-        """Return the line that sends the request of a registered exchange."""
+        """Return the line that contains the request of a registered exchange."""
         return request_line({"seq": exchange.number, **write_request(exchange.request)})
 
     def queue(self, line: bytes, exchange: Exchange) -> None:
@@ -383,7 +383,7 @@ class ClientCore:
         self._unsent.append((line, exchange))
         early, self._sent_early = self._sent_early, b""
         if not line.startswith(early):
-            raise AssertionError(f"{early!r} was sent early instead of {line!r}")
+            raise AssertionError(f"the request {line!r} was sent early as {early!r}")
         if early:
             self.mark_sent(len(early))
 

@@ -133,7 +133,8 @@ class GoalHandle(TrackedGoal):
         if self.id and (not self.state.terminal or self.state is State.LOST):
             failures: list[TalkError] = []
             self._connection.submit(Cancel((self.id,)), lambda *_: None, failures.append)
-            if failures and self._connection.unsent_bytes:  # the buffer is full; after a break, it would be empty
+            # If the connection has broken instead, the buffer is empty.
+            if failures and self._connection.unsent_bytes:
                 raise failures[0]
 
     def cancel(self) -> Goal:

@@ -324,7 +324,7 @@ def judge_tls_error(broker: Broker, message: str, code: int, now: float) -> Find
 
 
 def _describe_cas(broker: Broker) -> str:
-    """Return words for the CAs against which the broker's certificate is checked."""
+    """Describe the CAs that the broker's certificate is checked against."""
     return f"the CA in {broker.ca}" if broker.ca else "the system's CAs"
 
 

@@ -189,7 +189,7 @@ def explain_missing_server(places: list[SocketPlace], named_by: str | None, erro
 
 
 def _format_place(place: SocketPlace) -> str:
-    """Format a path and what was found there as words of a message."""
+    """Describe a path and what was found there."""
     whose = "" if place.uid is None or place.what not in {PLACE_FOREIGN, PLACE_FORBIDDEN} else f" (uid {place.uid})"
     return f"{place.path}: {place.what}{whose}"
 

@@ -473,7 +473,7 @@ def judge_silent_player(player: str | None, *, by_server: bool) -> Finding:
 
 
 def _describe_player_setting(by_server: bool) -> str:
-    """Return words that say whether the server or TALK_PLAYER configured the player."""
+    """Describe whether the server or TALK_PLAYER configured the player."""
     return "set by the server" if by_server else "set by TALK_PLAYER"
 
 

@@ -110,14 +110,14 @@ class Speak:
 
 @frozen
 class Stop:
-    """The command to stop speaking a goal at once. It is ignored if the goal has already ended."""
+    """The command to stop speaking a goal at once. The process ignores it if the goal has already ended."""
 
     id: str
 
 
 @frozen
 class Hold:
-    """The command to pause a goal, and to send `Held` once it is silent. It is ignored if the goal has ended."""
+    """The command to pause a goal. The process sends `Held` once the goal is silent, or nothing if it has ended."""
 
     id: str
     number: int  # number of this pause within the goal, starting at 1
@@ -125,14 +125,14 @@ class Hold:
 
 @frozen
 class Continue:
-    """The command to resume a paused goal. It is ignored if the goal is not paused."""
+    """The command to resume a goal. The process ignores it if the goal is not paused."""
 
     id: str
 
 
 @frozen
 class NextGoal:
-    """The command to update whether another goal waits behind the current one, and whether it has a neural voice."""
+    """The command that says whether another goal waits behind the current one, and whether it needs a neural voice."""
 
     id: str  # ID of the current goal
     next_waits: bool  # whether another goal is waiting in the queue

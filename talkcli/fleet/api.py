@@ -119,7 +119,7 @@ class Fleet:
         return self._send_request(to, Wait(None if ids is None else tuple(ids)))
 
     def status(self, to: str) -> FleetRequest:
-        """Request the status of each robot's server. Each outcome has it in `said["status"]`."""
+        """Request the status of each robot's server. Each outcome contains its status as `said["status"]`."""
         return self._send_request(to, Status())
 
     def pause(self, to: str) -> FleetRequest:

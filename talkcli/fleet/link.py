@@ -156,7 +156,7 @@ class Link:
             )
         except ssl.SSLCertVerificationError as error:
             words = f"the broker's certificate is not trusted: {error.verify_message} ({url})"
-            raise AccessDenied(f"{words}; set TALK_MQTT_CA to the file of the CA that issued it") from error
+            raise AccessDenied(f"{words}; set TALK_MQTT_CA to the certificate file of its CA") from error
         except ssl.SSLError as error:
             raise ServerUnavailable(f"TLS with the broker at {url} failed: {error.reason or error}") from error
         except (OSError, ValueError) as error:  # ValueError means that the host name is invalid

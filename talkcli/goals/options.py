@@ -95,12 +95,12 @@ def is_clients_id(goal_id: str) -> bool:
 
 
 def _id_error(value: str) -> str | None:
-    """Return an error message if an id is empty or too long, or None."""
+    """Return an error message if an id is empty or too long, otherwise None."""
     return None if 0 < len(value) <= MAX_ID_CHARS else f"must have 1 to {MAX_ID_CHARS} characters"
 
 
 def _ids_error(value: list[object]) -> str | None:
-    """Return an error message if a list of ids is too long or contains an invalid id, or None."""
+    """Return an error message if a list of ids is too long or contains an invalid id, otherwise None."""
     if len(value) > MAX_IDS:
         return IDS.wrong_type
     errors = (_id_error(each) if isinstance(each, str) else ID.wrong_type for each in value)
@@ -108,7 +108,7 @@ def _ids_error(value: list[object]) -> str | None:
 
 
 def _data_error(value: JsonObject) -> str | None:
-    """Return an error message if a goal's `data` is too large or nested too deeply, or None."""
+    """Return an error message if a goal's `data` is too large or nested too deeply, otherwise None."""
     import json
 
     try:
@@ -203,7 +203,7 @@ class Option:
         return self.special_flags or (f"--{self.name.replace('_', '-')}" if self.help else "")
 
     def type_error(self, value: Any) -> str | None:
-        """Return an error message if a value has the wrong type or format, or None."""
+        """Return an error message if a value has the wrong type or format, otherwise None."""
         if value is None and self.default is None:
             return None
         kind = self.kind
@@ -212,7 +212,7 @@ class Option:
         return kind.check(value) if kind.check else None
 
     def value_error(self, value: Any) -> str | None:
-        """Return an error message if a value of the right type is not allowed, or None."""
+        """Return an error message if a value of the right type is not allowed, otherwise None."""
         if value is None:
             return None
         if self.limits != (None, None) and self.is_out_of_range(value):
@@ -253,21 +253,21 @@ class Option:
 
 
 def _check_priority(value: int) -> str | None:
-    """Return an error message if a priority is out of range, or None."""
+    """Return an error message if a priority is out of range, otherwise None."""
     if -MAX_PRIORITY <= value <= MAX_PRIORITY:
         return None
     return f"the priority must be {-MAX_PRIORITY:,} to {MAX_PRIORITY:,}, got {value}"
 
 
 def check_key(value: str) -> str | None:
-    """Return an error message if a string is not a valid key, or None."""
+    """Return an error message if a string is not a valid key, otherwise None."""
     if 0 < len(value) <= MAX_KEY_CHARS:
         return None
     return f"the key must have 1 to {MAX_KEY_CHARS} characters, got {len(value)}"
 
 
 def _check_own_id(value: str) -> str | None:
-    """Return an error message if a client must not choose this id, or None."""
+    """Return an error message if clients must not choose this id, otherwise None."""
     if is_clients_id(value):
         return None
     return (
@@ -277,12 +277,12 @@ def _check_own_id(value: str) -> str | None:
 
 
 def _check_format(value: str) -> str | None:
-    """Return an error message if the value of the option `format` is not supported, or None."""
+    """Return an error message if the value of the option `format` is not supported, otherwise None."""
     return None if value == "text" else f"the format must be 'text', got {value[:MAX_ID_CHARS]!r}"
 
 
 def _check_voice(value: str) -> str | None:
-    """Return an error message if the name of a voice is empty, or None."""
+    """Return an error message if the name of a voice is empty, otherwise None."""
     return None if value else "the voice must not be empty"
 
 
@@ -612,7 +612,7 @@ INITIAL = Set(**{each.name: each.setting.initial for each in SETTINGS if each.se
 
 
 def bad_option(request: Say | Set) -> str | None:
-    """Return an error message if a request contains a value that is not allowed, or None."""
+    """Return an error message if a request contains a value that is not allowed, otherwise None."""
     if isinstance(request, Say) and request.flush and request.preempt is False:
         return "flush can't be combined with preempt false, because it always interrupts"
     for option in request.options:

@@ -475,7 +475,7 @@ class Scheduler:
         return options.bad_text(say.text, self.max_text) or refusal
 
     def _throttle(self, say: Say, record: Record, now: Now) -> Refusal | None:
-        """Return the reason to reject a goal that repeats another too soon, and set `record.by`, or return None.
+        """Return the reason if a goal repeats another one too soon, otherwise None. In the first case, set `record.by`.
 
         If the goal is rejected, `record.by` is set to the other goal.
         """
@@ -581,7 +581,7 @@ class Scheduler:
         return effects
 
     def _active_deadline(self) -> float:
-        """Return the monotonic time by which the active goal must be silent, or at which it expires, or inf.
+        """Return the monotonic time of the active goal's next time limit, or inf if it has none.
 
         If the goal is being stopped, it must be silent by then. Otherwise, it expires then, but only if the engine was
         lost before anything was heard, because the goal must start again.
@@ -637,7 +637,7 @@ class Scheduler:
         return self._end_unqueued(record, reason, details, by, now)
 
     def _end_unqueued(self, record: Record, reason: Reason, details: str, by: By | None, now: Now) -> list[Effect]:
-        """End a pending goal that is not in the queue with the state RECALLED."""
+        """End a pending goal as RECALLED. The goal must not be in the queue."""
         record.change_state(State.RECALLING)
         return self._end(record, State.RECALLED, reason, f"not spoken: {details}", by, now)
 

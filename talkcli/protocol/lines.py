@@ -180,14 +180,14 @@ def _refuse_constant(name: str) -> object:
 
 
 def _parse_integer(digits: str) -> int:
-    """Convert the digits of an integer. Raises ValueError if there are too many."""
+    """Convert a string of digits to an integer. Raises ValueError if the string is too long."""
     if len(digits) > MAX_DIGITS:
         raise ValueError(f"an integer has {len(digits):,} digits (at most {MAX_DIGITS})")
     return int(digits)
 
 
 def _parse_float(digits: str) -> float:
-    """Convert the digits of a float. Raises ValueError if the number is too large for a float."""
+    """Convert a string to a float. Raises ValueError if the number is too large."""
     number = float(digits)
     if not _is_finite(number):
         raise ValueError("a number is too large")

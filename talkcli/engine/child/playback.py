@@ -205,7 +205,7 @@ class PlayerFeed:
         return max(0.0, self.time_left(self.written, now))
 
     def time_left(self, byte_count: int, now: float) -> float:
-        """Return the seconds until this many bytes of the stream have been heard.
+        """Return how many seconds it takes until this many bytes of the stream have been heard.
 
         The result is negative if they have already been heard.
         """

@@ -189,7 +189,7 @@ def _convert_os_error(path: str, error: OSError) -> CannotWrite:
 
 
 def _display_name(path: str) -> str:
-    """Return the path for messages, or "standard output" if the path stands for it."""
+    """Return the name of the output for messages, which is a path or "standard output"."""
     return "standard output" if path in STANDARD_OUTPUT else path
 
 

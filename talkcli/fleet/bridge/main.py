@@ -356,7 +356,7 @@ class Bridge:
             log.write_bug("a message from the broker", error)
 
     def _handle_message(self, message: Message) -> None:
-        """Process a message from the broker: an echo, a presence, or a request that the policy accepts or refuses."""
+        """Process an echo, a presence message or a client's request, which the broker has delivered."""
         if message.topic == self._echo_topic:
             self._handle_echo(message.payload)
             return
@@ -384,7 +384,7 @@ class Bridge:
                 self._send_echo()
 
     def _handle_echo(self, payload: bytes) -> None:
-        """Process this bridge's own echo, or a bridge's question whether the robot's name is in use."""
+        """Process this bridge's own echo, or another bridge's question whether the robot's name is in use."""
         if payload.startswith(_RIVAL_QUESTION):
             if payload != _RIVAL_QUESTION + self._session.encode():
                 if self._online:

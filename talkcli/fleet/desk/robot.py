@@ -229,7 +229,7 @@ class RobotConnection(Connection):
             self.absent_since = time.monotonic()
 
     def _update_presence(self, payload: bytes) -> None:
-        """Update whether the robot is absent, from its presence message. If it is back, send open requests again.
+        """Record from a presence message whether the robot is absent. After an absence, send open requests again.
 
         It comes from the robot's bridge, or from the broker if the bridge has lost its connection.
         """
@@ -252,7 +252,7 @@ class RobotConnection(Connection):
     # -- connecting
 
     def wait_online(self, give_up: float) -> None:
-        """Wait until the robot can receive requests, at most until `give_up` (monotonic time).
+        """Wait until the robot can receive requests, or until the monotonic time `give_up`.
 
         If it is offline, wait until `give_up` (monotonic time). Raises the same errors as `connect_robot`.
         """
@@ -275,7 +275,7 @@ class RobotConnection(Connection):
     # -- after an absence
 
     def _resume_requests(self) -> None:
-        """After an absence, send each open request again, or fail it, or look up its goal."""
+        """After an absence, resend or fail each open request, or look up its goal."""
         now = time.monotonic()
         if self._sender:
             self._send_without_answer(Hello(self._sender))

@@ -342,7 +342,7 @@ class FleetRequest:
 
 
 class RobotRequest:
-    """A request to one of the robots of a `FleetRequest`."""
+    """The request to one robot that is part of a `FleetRequest`."""
 
     def __init__(self, connection: RobotConnection, request: Request, record: Callable[..., None]) -> None:
         """Prepare a request. All outcomes are passed to `record`."""

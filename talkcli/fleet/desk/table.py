@@ -169,7 +169,7 @@ class FleetTranscript:
         return self._transcripts[name].lines(event, screen, now)
 
     def change_lines(self, before: Presence | None, robot: Presence, screen: Screen, now: float) -> list[str]:
-        """Return the line that reports a change of a robot or its server. Also forget the robot's earlier goals.
+        """Return a line saying that a robot or its server has changed, and forget the robot's earlier goals.
 
         Args:
             before: the presence before the change, or None if the robot was unknown.

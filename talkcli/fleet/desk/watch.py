@@ -120,7 +120,7 @@ def read_robots(
 
 
 class _RetainedReader:
-    """Subscriber to some topics that collects all messages."""
+    """Subscribes to some topics, and collects all messages."""
 
     def __init__(self, wanted: list[str]) -> None:
         self._wanted = wanted

@@ -81,7 +81,7 @@ class HandoverTimes:
         self._previous = (player_name, last_sample_at) if self.next_waits else None
 
     def sentence_started(self, player_name: str, at: float, *, neural: bool = False) -> None:
-        """Record the delay since the end of the previous sentence, if this one was waiting then."""
+        """Record the delay since the previous sentence ended, if this sentence was already waiting at that time."""
         previous, self._previous = self._previous, None
         if previous is not None and previous[0] == player_name and 0 < at - previous[1] < MAX_HANDOVER_S:
             self._measured.setdefault((player_name, neural), deque(maxlen=MAX_HANDOVERS)).append(at - previous[1])
@@ -139,7 +139,7 @@ class PlayerChooser:
         yield from (partial(ProgramPlayer, command, self._inherited) for command in found)
 
     def begin(self, command: Speak) -> None:
-        """Store the settings that a `Speak` command has for its sentence, and forget the previous output."""
+        """Store a `Speak` command's settings for the player, and forget the previous output."""
         self._own_lead_in = command.lead_in
         self._audible = self._configure.audible if command.audible is None else command.audible
         self.output = None

@@ -250,7 +250,7 @@ class Model:
             raise self._not_piper_error(f"it makes {len(samples)} samples for {high - low} frames")
         part = samples[(begin - low) * hop : (end - low) * hop]
         if not np.isfinite(part).all():
-            raise VoiceFileError(f"{self.path} makes samples that are not numbers; download the voice again")
+            raise VoiceFileError(f"{self.path} produces invalid samples; download the voice again")
         return part
 
     def seconds(self, frames: int) -> float:
