@@ -299,10 +299,7 @@ def _try_voice(voice: str, options: EngineOptions, limit: float) -> VoiceTrial:
 
 
 def _speak(engine: PrivateEngine, voice: str, text: str) -> tuple[protocol.Ended, float | None]:
-    """Speak a text. Return how it ended, and the seconds it took to load the voice.
-
-    The loading time is None if the voice was not loaded during this call.
-    """
+    """Speak a text. Return how it ended, and how long the voice took to load, or None if it was loaded before."""
     load_s = None
     # Set `voice_only`, because otherwise espeak would speak if the voice isn't loaded.
     engine.speak(protocol.Speak(text, text, SENTENCE_RATE_WPM, 1.0, voice, 50, voice_only=True))

@@ -301,7 +301,7 @@ class Scheduler:
         return [*self.voices.engine_lost(now.monotonic)]
 
     def engine_ready(self, now: Now) -> list[Effect]:
-        """Record that an engine is ready, start the next goal, and load the next voice that goals need."""
+        """Record that an engine is ready, and return the orders to start the next goal and to load the next voice."""
         self.has_engine = self._loads_voices = True
         for voice in (*self._needed_voices(), self.settings.voice or ""):
             self._request_voice(voice, now)

@@ -245,16 +245,13 @@ class MeasuredText:
         """Return the characters from `start` to `end`, with invisible ones escaped."""
         return "".join(self._shown[start:end])
 
-    def _first_shown(self, column: int, start: int) -> int:
-        """Return the index of the first visible character if all columns before `column` are cut.
-
-        The index is never greater than `start`.
-        """
+    def _first_shown(self, column: int, last: int) -> int:
+        """Return the index of the first character to show behind an ellipsis at this column, but at most `last`."""
         if column <= 0:
             return 0
         # The ellipsis needs one more column. The first visible character must not be a combining mark.
-        begins = (place for place in range(start) if column < self._columns[place] < self._columns[place + 1])
-        return next(begins, start)
+        begins = (place for place in range(last) if column < self._columns[place] < self._columns[place + 1])
+        return next(begins, last)
 
     def _count_fitting(self, columns: int) -> int:
         """Return how many characters from the start of the text fit into this many columns."""

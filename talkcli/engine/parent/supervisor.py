@@ -233,7 +233,7 @@ class Supervisor:
         self._actions.call(lambda: self._process and self._process.send(command))
 
     def load(self, voice: str) -> None:
-        """Load a neural voice. `VoiceLoaded` is posted when loading has finished or failed."""
+        """Load a neural voice if an engine process is ready. `VoiceLoaded` is posted when it has finished or failed."""
         self._actions.call(lambda: self._load_voice(voice))
 
     def drop(self, voice: str) -> None:

@@ -106,7 +106,7 @@ class DeskLink:
         return topics.reply(self.user, self.session, robot)
 
     def poll(self, timeout: float, interrupt: Mapping[int, int] | None = None) -> bool:
-        """Wait for messages, and pass them to the handler. Connect or reconnect if necessary.
+        """Wait for messages, pass them to the handler, and return whether data was read. Reconnect if necessary.
 
         Args:
             timeout: the maximum time to wait in seconds.

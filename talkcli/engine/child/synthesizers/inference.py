@@ -102,8 +102,8 @@ class ModelCache:
 
         Args:
             key: The key of the model.
-            make_encoder: A function that creates the encoder and writes it to a path. It is called with None if the
-                halves can't be stored.
+            make_encoder: A function that creates the encoder and writes it to a path. If anything fails, it is called
+                again with None, and then writes nothing.
             decoder: The content of the decoder's file, in parts.
 
         Returns:

@@ -148,7 +148,7 @@ class ModelLoader:
         self.errors.pop(voice, None)
 
     def start(self, voice: str) -> None:
-        """Load a voice in the background, unless it is already loaded or queued."""
+        """Load a voice in the background, or report at once that it is loaded. Forget the voice's earlier error."""
         if voice in self._models:
             self._events.append(VoiceLoaded(voice, 0.0))
         elif voice not in self._waiting and not (self._load and voice == self._voice):
@@ -157,9 +157,9 @@ class ModelLoader:
             self._start_next_load()
 
     def get_model(self, voice: str) -> Model | None:
-        """Return the model of a voice, or None if it isn't loaded. Finish a load first if its thread is done.
+        """Return the model of a voice if it is loaded. Unload it first if it has failed and its files have changed.
 
-        If the voice has failed to speak, and its files have changed since it was loaded, it is unloaded.
+        If the thread of a load is done, finish the load first.
         """
         self._finish_load()
         model, fingerprints = self._models.get(voice, (None, ()))
