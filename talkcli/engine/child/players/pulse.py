@@ -333,7 +333,7 @@ class PulsePlayer(Player):
         return self._pending_levels > 0 or time.monotonic() < self._volume_settled_at
 
     def _record_mute(self) -> None:
-        """If the output is silent now, mark the sentence as muted. If it must be audible, record that the stream failed."""
+        """If the output is silent now, mark the sentence as muted, or as failed if it must be audible."""
         levels = [each for each in (self._sink_level, self._stream_level) if each is not None]
         if self._drained or self._is_volume_pending() or not any(each.muted or each.volume == 0 for each in levels):
             return
