@@ -92,8 +92,8 @@ class Link:
             on_message: called with each received message.
             will: retained message that the broker publishes if the connection breaks.
             max_packet_bytes: largest packet that the broker may send.
-            receive_maximum: how many unacknowledged QoS 1 messages the broker may send. None for the broker's default,
-                with which a flood can't stop mosquitto from delivering later messages.
+            receive_maximum: how many unacknowledged QoS 1 messages the broker may send. If None, the
+                broker's default applies, so that a flood of messages can't stop mosquitto from delivering later ones.
 
         Raises:
             UsageError: a certificate or key file is unusable.

@@ -168,7 +168,7 @@ class Goal:
 
 
 def read_fields(cls: type, message: object) -> dict[str, Any]:
-    """Return the fields of a class that a JSON object contains, as a dict. Values of the wrong type are skipped."""
+    """Read the fields of a class from a JSON object, and return a dict. Values of the wrong type are skipped."""
     found = {}
     values = message if isinstance(message, dict) else {}
     for name, annotation in cls.__annotations__.items():

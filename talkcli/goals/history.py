@@ -45,7 +45,7 @@ class History:
 
     def __init__(self) -> None:
         self._all: dict[str, Record] = {}
-        #: goal ids by state, oldest first, with SUCCEEDED used for all spoken goals
+        #: goal ids by state, oldest first. All spoken goals are listed under SUCCEEDED.
         self._ids: defaultdict[State, deque[str]] = defaultdict(deque)
         self._text_bytes = 0
 

@@ -67,7 +67,7 @@ class Queue:
         return list(map(_record_of, self._preempting[bisect_left(self._preempting, (-priority,)) :]))
 
     def displaceable_goal(self) -> Record | None:
-        """Return the newest goal of the lowest priority, which is removed first if the queue is full, or None."""
+        """Return the newest goal of the lowest priority, or None. It is removed first if the queue is full."""
         return self._displaceable[-1][2] if self._displaceable else None
 
     def add(self, record: Record, replaced: Record | None = None) -> None:

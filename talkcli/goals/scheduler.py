@@ -148,7 +148,7 @@ class Scheduler:
         return self._by_id.get(goal_id) or self.history.find(goal_id)
 
     def has_room(self, say: Say) -> bool:
-        """Return whether the queue has room for a goal, or can make room. A goal with a known id needs none."""
+        """Return whether the queue has room for a goal, or can make room. A known id needs no room."""
         attaches = say.id is not None and self.find(say.id) is not None
         return attaches or self._find_room(say) is not None
 
@@ -178,7 +178,7 @@ class Scheduler:
         canceled: By | None = None,
         waited_s: float = 0.0,
     ) -> tuple[Record, list[Effect]]:
-        """Reject a goal or add it to the queue, and start the next goal if possible.
+        """Reject a goal or add it to the queue. Return its record, and the effects to carry out.
 
         Args:
             say: the goal.
@@ -227,7 +227,7 @@ class Scheduler:
     def cancel(
         self, selection: Cancel, sender: Sender | None, now: Now, waiting: Collection[str | None] = ()
     ) -> Cancellation:
-        """End pending goals, have the engine stop the active goal, and remember cancels for unknown goals.
+        """Cancel the selected goals, and remember cancels for unknown ids. The result contains the effects.
 
         Args:
             selection: the goals to cancel.
@@ -251,7 +251,7 @@ class Scheduler:
         return result
 
     def change_settings(self, changes: dict[str, object], now: Now) -> list[Effect]:
-        """Change the server's settings for goals that have not started, and request the new voice, if any.
+        """Change the settings for goals that have not started, and request a new voice. Return the effects.
 
         A new voice that failed to load earlier is loaded again.
         """
@@ -263,7 +263,7 @@ class Scheduler:
         return self.tick(now)  # the next goal may not have to wait for its voice any more
 
     def pause(self) -> list[Effect]:
-        """Pause the active goal. No other goal starts until `resume` is called."""
+        """Prevent other goals from starting, and return the order to pause the active goal, if any."""
         if self.paused:
             return []
         self.paused = True
@@ -274,7 +274,7 @@ class Scheduler:
         return [EngineOrder(self.active, Order.HOLD)]
 
     def resume(self, now: Now) -> list[Effect]:
-        """Resume the paused goal, or start the next one."""
+        """End the pause. Return the effects that resume the paused goal or start the next one."""
         if not self.paused:
             return []
         self.paused = False
@@ -284,7 +284,7 @@ class Scheduler:
         return [EngineOrder(self.active, Order.RESUME)]
 
     def shutdown(self, now: Now) -> list[Effect]:
-        """End all pending goals, stop the active goal, and reject new goals."""
+        """End all pending goals, and reject new ones. The returned effects also stop the active goal."""
         self.closing = True
         effects: list[Effect] = []
         for record in list(self.pending):
@@ -296,7 +296,7 @@ class Scheduler:
     # -- reports from the engine
 
     def engine_lost(self, now: Now) -> list[Effect]:
-        """Record that the engine process has exited. No goal starts until a new engine is ready."""
+        """Record that the engine process has exited, so that no goal starts. Return warnings about voices."""
         self.has_engine = self._loads_voices = False
         return [*self.voices.engine_lost(now.monotonic)]
 
@@ -308,19 +308,22 @@ class Scheduler:
         return self._start_next(now) + self._order_next_voice(now)
 
     def engine_unavailable(self, now: Now) -> list[Effect]:
-        """Record that no engine can be started. From now on, goals fail at once instead of waiting."""
+        """Record that no engine can be started, so that goals fail at once. Return the effects."""
         self.has_engine, self._loads_voices = True, False
         return self._start_next(now)
 
     def fail_next(self, message: str, now: Now) -> list[Effect]:
-        """Fail the next goal with this message, unless an engine is available. Called after a long wait for one."""
+        """Fail the next goal, unless an engine is available, and return the effects.
+
+        Called after a long wait for an engine.
+        """
         if self.has_engine:
             return []
         record, effects = self._activate_next(now)
         return effects + self.failed(record.id, Reason.ENGINE_FAILED, message, None, now) if record else effects
 
     def word_heard(self, goal_id: str, end: int) -> None:
-        """Record that the active goal has been heard up to this offset in its text.
+        """Record how far the active goal has been heard. Raises IllegalTransition if it has another id.
 
         Args:
             goal_id: the id of the goal.
@@ -330,7 +333,7 @@ class Scheduler:
         record.spoken_end = max(record.spoken_end, end)
 
     def voice_chosen(self, goal_id: str, voice: str, now: Now) -> list[Effect]:
-        """Record which voice speaks the active goal, and load the next voice if possible."""
+        """Record which voice speaks the active goal. Return the order to load the next voice, if any."""
         self._require_active(goal_id).voice = voice
         return self._order_next_voice(now)
 
@@ -341,7 +344,7 @@ class Scheduler:
     def completed(
         self, goal_id: str, duration: float | None, now: Now, gaps: int = 0, gap_seconds: float = 0
     ) -> list[Effect]:
-        """End the active goal as SUCCEEDED, because it was played to the end.
+        """End the active goal as SUCCEEDED, because it was played to the end. Return the effects.
 
         Args:
             goal_id: the id of the goal.
@@ -363,7 +366,7 @@ class Scheduler:
         return self._end(record, State.SUCCEEDED, None, words, None, now)
 
     def failed(self, goal_id: str, reason: Reason, message: str, duration: float | None, now: Now) -> list[Effect]:
-        """End the active goal as ABORTED after a failure, or as PREEMPTED if it was being stopped anyway.
+        """End the active goal as ABORTED, or as PREEMPTED if it was being stopped. Return the effects.
 
         If the goal was being stopped, the failure has silenced it, so it ends PREEMPTED. It ends ABORTED only with the
         reason `not_silent`.
@@ -375,12 +378,12 @@ class Scheduler:
         return self._end(record, State.ABORTED, reason, f"speech failed: {message}", record.by, now)
 
     def stopped(self, goal_id: str, now: Now) -> list[Effect]:
-        """End the active goal as PREEMPTED, because it was stopped and the engine is silent."""
+        """End the active goal as PREEMPTED, because it was stopped and is silent. Return the effects."""
         record = self._require_active(goal_id)
         return self._end(record, State.PREEMPTED, record.reason, "Talk preempted", record.by, now)
 
     def voice_load_ended(self, voice: str, error: str | None, now: Now, *, has_libraries: bool) -> list[Effect]:
-        """Record that a voice was loaded or couldn't be. Start the next goal if it waited for this voice.
+        """Record that loading a voice succeeded or failed. Return the effects, such as starting a waiting goal.
 
         Args:
             voice: the id of the voice.
@@ -393,7 +396,7 @@ class Scheduler:
         return self._order_voice_drops() + self.tick(now)
 
     def voices_measured(self, voice: str, memory_bytes: int, now: Now) -> list[Effect]:
-        """Record how much memory all neural voices use, and order the engine to drop or load voices.
+        """Record how much memory all neural voices use. Return the orders to drop or load voices.
 
         Args:
             voice: the voice that was just loaded or has just spoken, or "" if a voice was dropped.
@@ -404,7 +407,7 @@ class Scheduler:
         return self._order_voice_drops() + self._order_next_voice(now)
 
     def voice_unloaded(self, voice: str, now: Now) -> list[Effect]:
-        """Record that the engine has dropped a voice without being told to, and load the next voice."""
+        """Record that the engine dropped a voice on its own. Return the order to load the next voice, if any."""
         self.voices.unloaded(voice, self._needed_voices())
         return self._order_next_voice(now)
 
@@ -415,7 +418,7 @@ class Scheduler:
         return min(self._active_deadline(), self.pending.next_expiry(), self._next_deadline())
 
     def tick(self, now: Now) -> list[Effect]:
-        """Handle the time limits that have been reached: end expired goals, and start the next one if possible.
+        """Handle all time limits that have been reached, and return the effects.
 
         Expired goals are recalled. If the active goal was stopped and did not become silent in time, it is aborted. The
         next goal starts if it no longer has to wait for its voice.
@@ -475,7 +478,7 @@ class Scheduler:
         return options.bad_text(say.text, self.max_text) or refusal
 
     def _throttle(self, say: Say, record: Record, now: Now) -> Refusal | None:
-        """Return the reason if a goal repeats another one too soon, otherwise None. In the first case, set `record.by`.
+        """Return the reason if a goal repeats another one too soon, otherwise None. May set `record.by`.
 
         If the goal is rejected, `record.by` is set to the other goal.
         """
@@ -519,7 +522,7 @@ class Scheduler:
         return [(last, Reason.DISPLACED)] if last and last.say.priority <= limit else None
 
     def _enqueue(self, record: Record, recalled: list[tuple[Record, Reason]], now: Now) -> list[Effect]:
-        """Add a goal to the queue, recall the given goals, and stop the active goal if it is preempted."""
+        """Add a goal to the queue, and recall the given goals. The returned effects stop a preempted active goal."""
         by = By(goal=record.id)
         effects: list[Effect] = []
         replaced = None
@@ -549,7 +552,7 @@ class Scheduler:
         return list(filter(options.is_neural, dict.fromkeys(voices)))
 
     def _order_next_voice(self, now: Now) -> list[Effect]:
-        """Choose the next voice to load, record that it is loading, and return the order in a list, if any.
+        """Choose the next voice to load, and mark it as loading. Return a list with the order, if any.
 
         The first voice is not loaded while a goal is active. Loading it imports libraries, which blocks the engine
         process for a tenth of a second.
@@ -574,7 +577,7 @@ class Scheduler:
     # -- starting and ending goals
 
     def _expire(self, now: Now) -> list[Effect]:
-        """End all pending goals that have expired as RECALLED."""
+        """Recall all pending goals that have expired, and return the effects."""
         effects: list[Effect] = []
         for record in self.pending.expired(now.monotonic):
             effects += self._recall(record, Reason.EXPIRED, _expiry_message(record), None, now)
@@ -605,14 +608,14 @@ class Scheduler:
         return self.voices.start_time(record, self.settings.voice) if self._loads_voices else 0.0
 
     def _start_next(self, now: Now) -> list[Effect]:
-        """Make the next goal ACTIVE and return the order to speak it, if there is an engine and a goal can start."""
+        """Make the next goal ACTIVE if possible. Return the effects, including the order to speak it."""
         if not self.has_engine:
             return []
         record, effects = self._activate_next(now)
         return [*effects, EngineOrder(record, Order.START)] if record else effects
 
     def _activate_next(self, now: Now) -> tuple[Record | None, list[Effect]]:
-        """Make the next goal ACTIVE if it can start, and return it with the effects, but no order to the engine.
+        """Make the next goal ACTIVE if possible. Return it, and the effects without the order to speak it.
 
         Return None instead of a goal if no goal can start now.
         """
@@ -632,12 +635,12 @@ class Scheduler:
         return record, [*effects, StateChange(record, State.ACTIVE)]
 
     def _recall(self, record: Record, reason: Reason, details: str, by: By | None, now: Now) -> list[Effect]:
-        """Remove a goal from the queue and end it with the state RECALLED."""
+        """Remove a goal from the queue, and end it as RECALLED. Return the effects."""
         self.pending.remove(record)
         return self._end_unqueued(record, reason, details, by, now)
 
     def _end_unqueued(self, record: Record, reason: Reason, details: str, by: By | None, now: Now) -> list[Effect]:
-        """End a pending goal as RECALLED. The goal must not be in the queue."""
+        """End a pending goal that isn't in the queue as RECALLED. Return the effects."""
         record.change_state(State.RECALLING)
         return self._end(record, State.RECALLED, reason, f"not spoken: {details}", by, now)
 
@@ -659,7 +662,7 @@ class Scheduler:
     def _end(
         self, record: Record, state: State, reason: Reason | None, message: str, by: By | None, now: Now
     ) -> list[Effect]:
-        """Set a goal's final state and move it to the history. If it was the active goal, start the next one."""
+        """Set a goal's final state, and move it to the history. Return the effects, such as starting the next goal."""
         record.change_state(state)
         record.reason, record.message, record.by = reason, message, by
         record.ended_at, record.paused = now.wall, False

@@ -194,7 +194,7 @@ class VoiceScheduler:
         return None
 
     def drop_excess(self, first: str, needed: Sequence[str]) -> list[VoiceDropOrder | VoiceWarning]:
-        """Drop voices until the others fit into the memory limit, and return orders and warnings.
+        """Record which voices to drop to meet the memory limit. Return the orders to drop them, and any warnings.
 
         This is necessary if the voices use more memory than was estimated.
 

@@ -255,7 +255,7 @@ def failure(seq: int | None, code: str, message: str) -> JsonObject:
 
 
 def take_seq(message: JsonObject) -> int | None:
-    """Remove the `seq` number from a request, and return it, or None. Raises BadRequest if it isn't an integer."""
+    """Remove and return a request's `seq` number, if it has one. Raises BadRequest if it isn't an integer."""
     seq = message.pop("seq", None)
     if seq is not None and (isinstance(seq, bool) or not isinstance(seq, int)):
         raise BadRequest("'seq' must be an integer", "bad_field")

@@ -3,7 +3,7 @@
 Rules for this file: it only defines the form of requests. The scheduler decides whether a goal is admitted. A request
 is a class with a row for each of its fields. The classes of `say`, `cancel` and `set` are in `goals.options`. Fields
 may be added, but never renamed or given another meaning. A field without a row is refused and never ignored, because a
-client must know that a server doesn't support it. `meaning` is the text in the wire's table.
+client must know that a server doesn't support it. `meaning` is shown in the protocol's document.
 """
 
 from __future__ import annotations

@@ -263,7 +263,7 @@ class ClientConnection(asyncio.Protocol):
     # -- called by the handler
 
     def send(self, message: JsonObject | bytes) -> None:
-        """Send a reply or an encoded line after all unfinished lists, or disconnect if too many lines wait."""
+        """Send a reply or an encoded line after all unfinished lists. If too many lines wait, disconnect the client."""
         if self._half_closed:  # if this is the last reply, close the connection soon
             self._schedule_work()
         line = message if isinstance(message, bytes) else encode(message)
@@ -310,7 +310,7 @@ class ClientConnection(asyncio.Protocol):
         return self._loop.call_later(seconds, self.close_with, failure(None, "too_slow", message))
 
     def _update_reading(self) -> None:
-        """Start or stop reading from the client, and the time limit for an incomplete line.
+        """Start or stop reading from the client. Also start or cancel the time limit for an incomplete line.
 
         The server reads only while the client reads its replies and has few unprocessed lines.
         """

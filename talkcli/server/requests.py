@@ -204,7 +204,7 @@ class Requests:
     # -- coroutines, named after the requests that they handle
 
     async def _say(self, pending: PendingRequest, say: Say) -> None:
-        """Submit a goal, after waiting for room if it is a `patient` goal and the queue is full, and reply."""
+        """Submit a goal and reply. If the queue is full, a `patient` goal first waits for room."""
         speech, scheduler, connection = self._speech, self._scheduler, pending.connection
         waited = 0.0
         if pending.canceled_by is None:
@@ -238,7 +238,7 @@ class Requests:
         speech.apply(effects)
 
     def _check_goal(self, pending: PendingRequest, say: Say) -> tuple[Say, Refusal | None]:
-        """Return the goal with the id of its voice, and the server's reason to refuse the goal, or None.
+        """Fill in the id of a goal's voice. Return the new goal, and the reason to refuse it, if any.
 
         Refusals that need a clock, files or other I/O belong here. The scheduler decides about all others.
         """
@@ -333,7 +333,7 @@ class Requests:
         log.write(f"{'paused' if paused else 'resumed'} by {describe_sender(client)}")
 
     def _answer_pause(self, pending: PendingRequest, goal: Record | None) -> None:
-        """Reply to a `pause` or `resume` request, with the goal unless it has ended."""
+        """Reply to a `pause` or `resume` request. The reply contains the goal unless it has ended."""
         shown = None if goal is None or goal.state.terminal else goal.snapshot().to_json()
         pending.answer(paused=self._scheduler.paused, goal=shown)
 
@@ -406,7 +406,7 @@ def _unknown_message(*ids: str) -> str:
 
 
 def _goal_items(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:
-    """Yield a list item for each goal, with a copy of the goal in the field `name`, made when it is sent."""
+    """Yield a list item for each goal, with the goal in the field `name`. The goal is copied when the item is sent."""
     return ({name: each.snapshot().to_json()} for each in records)
 
 

@@ -179,9 +179,9 @@ class Server:
             raise self._fatal_error
 
     def _prepare_voice(self) -> str | None:
-        """Return the configured voice if the engine must check it. Check and set a neural voice, and return None.
+        """Return the configured voice if the engine must check it, otherwise None. A neural voice is checked here.
 
-        A neural voice is checked here. It becomes a setting and is loaded later, so that it doesn't delay speech.
+        A neural voice becomes a setting and is loaded later, so that it doesn't delay speech.
 
         Raises:
             UsageError: if a neural voice is unknown.

@@ -109,7 +109,7 @@ class Speech:
         self.silent_goal: Record | None = None
         #: unprocessed reports from the engine thread
         self._reports: deque[Report] = deque()
-        #: whether the event loop has been woken to process reports, which is too slow to do for each report
+        #: whether the event loop has been woken to process reports. Waking it for each report would be too slow.
         self._reports_due = False
         #: what the engine was last told: whether another goal follows, and whether its voice is neural
         self._announced_next = False, False
@@ -133,7 +133,7 @@ class Speech:
         return self.voices.listed is None and self.engine_status in {"starting", READY}
 
     def waiting_for_silence(self, record: Record) -> WaitingList:
-        """Return the requests that wait for this goal to become silent, to continue or to end."""
+        """Return the waiting list for requests that continue when this goal falls silent, resumes or ends."""
         return self._waiting_for_silence.setdefault(record, {})
 
     # -- the scheduler's effects

@@ -54,9 +54,8 @@ _NO_CONNECTION = {errno.EAGAIN, errno.ECONNABORTED, errno.EPROTO, errno.EINTR}
 class ClientStreams:
     """The streams of all clients, which send their output together and share a limit for unread output.
 
-    It sends their output at the end of each iteration of the event loop, and limits the unread output of all clients
-    together. All streams share one callback per iteration. This saves a third of the time if fifty clients watch the
-    words.
+    The output is sent at the end of each iteration of the event loop, in one callback for all streams. This saves a
+    third of the time if fifty clients watch the words.
     """
 
     def __init__(self) -> None:
@@ -170,7 +169,7 @@ class ClientStream:
         return len(self._unread)
 
     def count_held(self, size_bytes: int) -> None:
-        """Add to the size of the output that the receiver holds back (may be negative), and enforce the limits."""
+        """Change the size of the output that the receiver holds back by `size_bytes`, and enforce the limit."""
         if self in self._streams.open:
             self.held_bytes += size_bytes
             self._streams.unread_bytes += size_bytes

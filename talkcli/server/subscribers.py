@@ -97,7 +97,7 @@ class Subscribers:
                 connection.publish(lines)
 
     def word_heard(self, word: Word, text: str, at: float) -> None:
-        """Publish that a word is being spoken to the connections that want feedback.
+        """Send a word that is being spoken to the connections that want feedback.
 
         Args:
             word: the engine's event.
@@ -118,7 +118,7 @@ class Subscribers:
             self._alive_timer = self._loop.call_later(CLIENT_ALIVE_INTERVAL_S, self._send_alive)
 
     def _feedback_receivers(self, waiters: Iterable[dict[ClientConnection, bool]]) -> dict[ClientConnection, None]:
-        """Return all connections that watch, and those of the waiting connections that want feedback."""
+        """Return all connections that watch, and the waiting ones that want feedback."""
         listeners = dict(self._watchers)
         for each in waiters:
             listeners.update((connection, None) for connection, feedback in each.items() if feedback)
@@ -164,7 +164,7 @@ class Notifications:
         return not self._pending
 
     def add(self, notifications: Iterable[Callable[[], None]]) -> None:
-        """Add functions to the queue, and begin to call them. Functions added by another one are called at once."""
+        """Queue functions, and start calling them. If a called function adds more, those are called at once."""
         if self._working:
             for each in notifications:
                 self._call(each)
@@ -202,7 +202,7 @@ class Notifications:
             self._turn = self._loop.call_soon(self._work, min(unread_before, self._streams.unread_bytes))
 
     def _await_readers(self, unread_before: int, until: float) -> None:
-        """Continue when the clients have read the new output, or at the time `until` at the latest."""
+        """Continue if clients have read the new output or the time `until` has come. Otherwise, check again soon."""
         if self._streams.unread_bytes <= unread_before:
             self._work(unread_before)
         elif self._loop.time() < until:

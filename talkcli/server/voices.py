@@ -71,7 +71,7 @@ class VoiceCatalog:
 
     @property
     def _driver_voices(self) -> tuple[Voice, ...]:
-        """Voices listed by the engine that are not neural."""
+        """The voices that the engine has listed, without neural ones."""
         return tuple(each for each in self.listed or () if not is_neural(each.id))
 
     def _candidates(self, voice: str) -> tuple[Voice, ...]:

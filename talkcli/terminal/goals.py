@@ -252,9 +252,8 @@ def _describe_sender(sender: Sender | None) -> str:
 def sender_forms(sender: Sender | None, screen: Screen) -> list[str]:
     """Return alternative descriptions of a sender, longest first, so that the first one that fits can be shown.
 
-    The command and the process id are only included with `screen.long`.
-
-    The name that the sender has chosen comes first. It is in quotes because it isn't verified.
+    The command and the process id are only included with `screen.long`. The name that the sender has
+    chosen comes first. It is in quotes because it isn't verified.
     """
     if sender is None:
         return [_UNKNOWN_SENDER]
@@ -279,7 +278,7 @@ def listed_reason_forms(goal: Goal, screen: Screen) -> list[str]:
 
 
 def reason_forms(goal: Goal, screen: Screen) -> list[str]:
-    """Return descriptions of why a goal ended and who ended it, longest first, or the duration of a success."""
+    """Return descriptions of why a goal ended, longest first. For a success, return the duration instead."""
     if goal.state is State.SUCCEEDED:
         return [", ".join([*([] if goal.duration is None else [f"{goal.duration:.1f} s"]), *_muted_note(goal)])]
     reason = printable(goal.reason or goal.state.name.lower())

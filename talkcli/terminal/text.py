@@ -91,7 +91,7 @@ class Screen:
         return self.fit_name(number if number.isdecimal() else goal_id, _MIN_ID_COLUMNS, 8)
 
     def coloured(self, text: str, state: State | None) -> str:
-        """Return the text in the colour of a state, or in bold if the state is None, if the output has colours."""
+        """Colour a text by its state, or make it bold if the state is None. Without colours, return it unchanged."""
         code = _STATE_COLOURS.get(state) if state is not None else "1"
         return f"\x1b[{code}m{text}\x1b[0m" if self.colour and code else text
 

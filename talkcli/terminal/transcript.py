@@ -63,7 +63,7 @@ class ColumnWidths:
         return pad(shown, self._robots)
 
     def pad_goal_id(self, goal_id: str, screen: Screen) -> str:
-        """Shorten a goal id for display, and pad it to the width of its column, which may first become wider."""
+        """Shorten a goal id for display, and pad it to the width of its column, which is widened if necessary."""
         shown = screen.goal_id(goal_id)
         self._ids = max(self._ids, _FIRST_NAME_COLUMNS * screen.long, min(width(shown), _MAX_NAME_COLUMNS))
         return pad(shown, self._ids)

@@ -175,7 +175,7 @@ class RobotConnection(Connection):
 
     def goals_lost_at(self) -> float:
         """Return infinity, because `silent_by` ends the connection before goals count as lost."""
-        return float("inf")  # `silent_by` ends the connection before goals count as lost.
+        return float("inf")
 
     def silent_by(self, began: float) -> tuple[float, str]:
         """Return the time at which to give up on a silent or absent robot, and the reason to report."""
@@ -184,7 +184,7 @@ class RobotConnection(Connection):
         return self.absent_since + ABSENCE_LIMIT_S, f"{self.absence} (for {ABSENCE_LIMIT_S:g} s)"
 
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
-        """Return the error that a refusing reply reports. Errors of the bridge have classes of their own."""
+        """Return the error for a reply that refuses a request, with a special class for errors of the bridge."""
         error = super().refusal(reply, items)
         kinds = {"not_allowed": AccessDenied, "no_server": NoServer, "stale": ServerUnavailable, "lost": Lost}
         kind = kinds.get(error.code)
@@ -252,9 +252,9 @@ class RobotConnection(Connection):
     # -- connecting
 
     def wait_online(self, give_up: float) -> None:
-        """Wait until the robot can receive requests, or until the monotonic time `give_up`.
+        """Wait until the robot can receive requests. Raises an error if it still can't at the time `give_up`.
 
-        If it is offline, wait until `give_up` (monotonic time). Raises the same errors as `connect_robot`.
+        `give_up` is a monotonic time. The errors are the same as those of `connect_robot`.
         """
         left = self._patience if self._end is None else max(0.0, self._end - time.monotonic())
         self._desk.wait_for_retained(min(self._patience, left), lambda: bool(self._presence), self._interrupt)
@@ -340,7 +340,7 @@ class RobotConnection(Connection):
         self._begin(Exchange(Wait((str(request.id),), request.feedback), on_reply, on_failure), now)
 
     def _begin(self, exchange: Exchange, now: float) -> None:
-        """Queue a request that looks up a goal, and send it if not too many are open."""
+        """Queue a goal lookup, and send it now if the number of open lookups allows it."""
         self._lookups.append(exchange)
         self._send_lookups(now)
 

@@ -142,7 +142,7 @@ class FleetRequest:
         return None if self._desk.link else f"the connection to the broker at {self._desk.broker.url} was lost"
 
     def results(self, timeout: float | None = None) -> Iterator[Outcome]:
-        """Yield the outcomes as they arrive.
+        """Yield the outcomes as they arrive. Raises TimeoutError if some are missing after `timeout` seconds.
 
         After a TimeoutError or Interrupted, call this again to receive the remaining outcomes.
 
@@ -228,7 +228,7 @@ class FleetRequest:
                 self._on_presence(robot, robot.presence)
 
     def _on_refused(self, error: TalkError) -> None:
-        """Store the error for `results` to raise, because the broker has rejected the message to the group."""
+        """Store an error for `results` to raise. Called if the broker rejects the message to the group."""
         self._refused = error
 
     def _check_for_late_robots(self) -> None:
@@ -326,7 +326,7 @@ class FleetRequest:
         return self._robots[name]
 
     def _include(self, name: str) -> None:
-        """Add a robot to those that the request is for."""
+        """Add a robot to the receivers of the request."""
         self._included.add(name)
         self._unfinished.add(name)
 
@@ -336,13 +336,13 @@ class FleetRequest:
             self._robots[name].update(check_time=check_time)
 
     def _record(self, *outcomes: Outcome) -> None:
-        """Add outcomes to those that `results` yields. A robot has finished after its last outcome."""
+        """Store outcomes for `results` to yield, and mark robots as finished after their last outcome."""
         self._outcomes += outcomes
         self._unfinished -= {each.robot for each in outcomes if each.last}
 
 
 class RobotRequest:
-    """The request to one robot that is part of a `FleetRequest`."""
+    """The part of a `FleetRequest` that concerns one robot."""
 
     def __init__(self, connection: RobotConnection, request: Request, record: Callable[..., None]) -> None:
         """Prepare a request. All outcomes are passed to `record`."""

@@ -112,7 +112,7 @@ def _format_age(seconds: float) -> str:
 
 
 def _fit_columns(widths: dict[str, int], room: int | None) -> None:
-    """Make a line fit into `room` characters: shrink SPEAKING in `widths`, and remove other columns."""
+    """Shrink the column SPEAKING in `widths`, and remove other columns, until a line fits into `room`."""
     longest = widths["SPEAKING"]
     if room is None:
         widths["SPEAKING"] = min(longest, _USUAL_TEXT_CHARS)

@@ -174,7 +174,7 @@ class FleetWatch:
         #: when the connection to the broker was lost (monotonic time) and why, or None if the broker is connected
         self._away_since: float | None = time.monotonic()
         self._away_why = ""
-        #: the robots that haven't reconnected since the broker is back, with their time limits (monotonic time)
+        #: the robots that haven't reconnected since the broker came back, with their time limits (monotonic time)
         self._missing: dict[str, float] = {}
 
     def events(self, interrupt: Mapping[int, int] | None = None) -> Iterator[FleetEvent]:
@@ -238,7 +238,7 @@ class FleetWatch:
     # -- time limits
 
     def _handle_due(self, now: float) -> None:
-        """Process retained messages if complete, forget missing robots, and raise Lost if the broker stays away."""
+        """Report missing robots, and process complete retained messages. Raises Lost if the broker is away too long."""
         if self._retained is not None and self._desk.retained_received:
             self._process_retained(self._retained, now)
         if self._away_since is not None and now - self._away_since >= ABSENCE_LIMIT_S:
@@ -282,7 +282,7 @@ class FleetWatch:
             self._events.append(RobotChanged(name, before, now))
 
     def _report_missed(self, name: str, status: RobotStatus | None, arrived: Container[str | None] = ()) -> None:
-        """Report missed events of a robot, if its status shows that they happened.
+        """Report an EventsMissed if a robot's status shows goals that haven't been reported.
 
         Args:
             name: the name of the robot.
