@@ -196,7 +196,7 @@ def _show_canceled(done: Canceled, options: CommonOptions) -> None:
 
 
 def _suggest_key(key: str, client: Client) -> None:
-    """Print a message that suggests a similar key of an unfinished goal, if there is one."""
+    """If an unfinished goal has a similar key, suggest that key in a message."""
     from talkcli.terminal.text import printable
 
     try:

@@ -189,7 +189,7 @@ class ClickCommand(_HelpfulCommand):
         )
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the help of the command's own options, but not that of the common options."""
+        """Write the help texts of the command's own options, without the common options."""
         self.write_options("Options", (each for each in self.params if each.expose_value), ctx, formatter)
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -198,7 +198,7 @@ class ClickCommand(_HelpfulCommand):
         formatter.write("\nCommon options and exit codes: talk --help\n")
 
     def _run(self, **given: Any) -> int | None:
-        """Run the command with these values, or raise a click.UsageError if they can't be combined."""
+        """Run the command, and return its exit code. Raise a click.UsageError if its options can't be combined."""
         context = click.get_current_context()
         options: CommonOptions = context.obj
         source = context.get_parameter_source
@@ -209,7 +209,7 @@ class ClickCommand(_HelpfulCommand):
         return self.row.run(options, given)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the arguments, and raise a click.UsageError for extra ones, except during completion."""
+        """Parse the arguments, and raise a click.UsageError for extra arguments, except during completion."""
         ctx.allow_extra_args = True  # extra arguments are reported below
         try:
             rest = super().parse_args(ctx, args)
@@ -238,7 +238,7 @@ class _CommandGroup(_HelpfulCommand, click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Return the command's name, the command and its arguments. Raise an error with a hint if it is unknown."""
+        """Return a command's name, the command and its arguments. Raise click.UsageError for an unknown command."""
         unknown = args[0] not in COMMANDS and args[0][:1] not in ("", "-")
         if unknown and not ctx.resilient_parsing:  # errors aren't shown during completion
             raise click.UsageError(_describe_unknown_command(args), ctx)
@@ -291,7 +291,7 @@ def run(arguments: list[str]) -> int:
 
 
 def _run_group(arguments: list[str], options: CommonOptions) -> object:
-    """Return the result of a command line that click runs. Report click's errors, and return their exit codes."""
+    """Run a command line with click, and return its result. Report click's errors, and return their exit codes."""
     try:
         with talk.make_context("talk", [*arguments], obj=options) as context:
             return talk.invoke(context)

@@ -260,14 +260,14 @@ def _format_byte(character: str) -> str:
 
 
 def replace_bad_bytes(text: str, first_line: int = 1) -> tuple[str, str | None]:
-    """Replace invalid UTF-8 in a text by U+FFFD, and return the text with a message, or with None if it was valid.
+    """Replace invalid bytes in a text with U+FFFD. Return the text, and a message about the replaced bytes.
 
     Args:
         text: the text, with invalid bytes decoded to surrogates.
         first_line: the number of the text's first line.
 
     Returns:
-        The text, and a message about the replaced bytes, or None if there were none.
+        The text and the message. The message is None if all bytes were valid.
     """
     if text.isascii():
         return text, None

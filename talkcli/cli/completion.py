@@ -51,7 +51,7 @@ _BASH_SPECIAL = re.compile(r"[^\w@%+=:,./-]")
 
 
 def print_completions(talk: click.Command, options: CommonOptions) -> int:
-    """Print the completions of the line that a shell's script has passed, and return the exit code."""
+    """Print the completions of the line that the completion script has passed, and return the exit code."""
     try:
         click.echo("\n".join(_completion_lines(talk, options)).encode())
     except Exception:
@@ -62,7 +62,7 @@ def print_completions(talk: click.Command, options: CommonOptions) -> int:
 
 
 def _completion_lines(talk: click.Command, options: CommonOptions) -> list[str]:
-    """Return the completions of the line in COMP_WORDS, in the format of the shell's script."""
+    """Return the completions of the line in COMP_WORDS, in the format of the completion script."""
     line, shell = os.environ["COMP_WORDS"], os.environ["_TALK_COMPLETE"].removesuffix("_complete")
     words = split_arg_string(line)
     # If the next character would start a new word, the word to complete is empty.
@@ -74,7 +74,7 @@ def _completion_lines(talk: click.Command, options: CommonOptions) -> list[str]:
 
 
 def _format_for_bash(word: str, value: str, _: str | None) -> str:
-    """Quote a value for bash's completion script, and remove the part that bash keeps.
+    """Quote a value for bash, without the beginning that bash leaves on the command line.
 
     bash replaces the text in COMP_CWORD, which may be only the last part of the word.
     """

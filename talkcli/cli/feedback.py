@@ -79,7 +79,7 @@ class _LineFeedback(Feedback):
             self._shown.pop(event.goal.id, None)
 
     def _show_state(self, goal_id: str, state: State) -> None:
-        """Print the state of a goal, unless it was the last one that was printed for this goal."""
+        """Print the state of a goal, unless it hasn't changed since it was last printed."""
         # The end of a goal is usually reported twice, as a new state and as a result. Print it only once.
         if self._shown.get(goal_id) is not state:
             self._shown[goal_id] = state
@@ -102,7 +102,7 @@ class _TerminalFeedback(Feedback):
         self._resizes = _ResizeWatcher(self._paint)
 
     def begin(self, goals: Sequence[Goal]) -> None:
-        """Show the goal that is being spoken, or else the first unfinished one, if no goal is shown yet."""
+        """If no goal is shown yet, show the one that is being spoken, or else the first unfinished goal."""
         unfinished = [each for each in goals if not each.state.terminal]
         if unfinished and self._line is None:
             spoken = (each for each in unfinished if each.state is not State.PENDING)
@@ -134,7 +134,7 @@ class _TerminalFeedback(Feedback):
         self._paint()
 
     def close(self) -> None:
-        """Write the current goal's whole sentence, end the line, and stop adapting it to the terminal's width."""
+        """Write the current goal's whole sentence, end the line, and stop watching for terminal resizes."""
         self._resizes.close()
         if self._line:
             self._write_whole(self._line)

@@ -100,5 +100,5 @@ def _show_event(
 
 
 def _snapshot_object(robot: RobotInfo) -> JsonObject:
-    """Return the JSON object in which `talk fleet watch` prints the whole state of a robot."""
+    """Return the JSON object that `talk fleet watch` prints for the whole state of a robot."""
     return {"robot": robot.presence.name, "event": "snapshot", **robot.to_json()}

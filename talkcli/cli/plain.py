@@ -190,7 +190,7 @@ def _early_request(command: str, given: dict[str, Any]) -> JsonObject | None:
         return write_request(say) if say else None
     if command == "cancel":
         ids, before, key = given["ids"], given["before"], given["key"]
-        # Leave several ids to the library. They may contain duplicates or be too many for one request.
+        # Let the library handle several ids, because there may be duplicates or too many for one request.
         if len(ids) > 1 or not all(map(_is_full_id, [*ids, before or "-"])) or (key and check_key(key)):
             return None
         return write_request(Cancel(ids or None, given["current"], before, key))

@@ -123,10 +123,12 @@ def _report_sent(goal: GoalHandle, options: CommonOptions, reporter: GoalReporte
 def _wait_for_goal(
     goal: GoalHandle, interrupts: Interrupts, timeout: float | None, options: CommonOptions, reporter: GoalReporter
 ) -> int:
-    """Wait until a goal has ended, or cancel it if interrupted or late. Report the end, and return the exit code.
+    """Wait until a goal has ended, report it, and return the exit code. Cancel it on an interrupt or timeout.
 
-    The goal is cancelled if the wait is interrupted or times out. However, if an earlier command has already sent a
-    goal with the same id, that goal isn't cancelled.
+    If an earlier command has already sent a goal with the same id, that goal isn't cancelled.
+
+    Raises:
+        TimedOut: the goal hasn't succeeded in time.
     """
     try:
         reporter.show_accepted(goal)

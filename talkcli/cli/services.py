@@ -185,7 +185,7 @@ def _format_option(option: Option, value: object) -> str:
 
 
 def _find_inaccessible(files: Sequence[str]) -> tuple[str, str] | None:
-    """Return the first file that other users can't reach and the directory that blocks them, or None."""
+    """Return a file that other users can't reach and the directory that blocks them, or None if there is none."""
     for path in files:
         steps = path.split(os.sep)
         for count in range(2, len(steps)):

@@ -157,7 +157,7 @@ class _OutcomePrinter:
         self._terminal = sys.stderr if shows_count else None
 
     def show_outcomes(self, fleet_request: FleetRequest, timeout: float | None) -> None:
-        """Record and print each outcome as it arrives, and keep the number of finished robots on the screen.
+        """Record and print each outcome as it arrives, and show a running count of finished robots.
 
         This raises the same errors as `FleetRequest.results`.
         """
@@ -172,7 +172,7 @@ class _OutcomePrinter:
             self._clear_count()
 
     def _record(self, outcome: Outcome) -> None:
-        """Record an outcome. A robot's earlier failure is kept, unless it seemed to be the final outcome."""
+        """Store a robot's latest outcome. An earlier failure is only replaced if it seemed to be final."""
         before = self._outcomes.get(outcome.robot)
         # If a robot answers after a failure that seemed final, it only appeared to be absent. Replace the failure.
         if before is not None and before.exit_code and not before.last:

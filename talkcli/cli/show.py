@@ -261,7 +261,7 @@ def show_json(message: JsonObject) -> None:
 
 
 def show_result(options: CommonOptions, items: Iterable[JsonObject], lines: Callable[[], Iterable[str]]) -> None:
-    """Print `items` as JSON objects with --json, otherwise the lines of text that `lines` returns."""
+    """With --json, print `items` as JSON objects. Otherwise, print the lines that `lines` returns."""
     if options.json:
         for item in items:
             show_json(item)

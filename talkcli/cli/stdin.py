@@ -153,7 +153,7 @@ class LineBuffer:
         return self._lines.popleft()
 
     def take_expired(self, now: float) -> Iterator[InputLine]:
-        """Remove and yield expired lines, at most 1,000 at once so that the caller can check for signals."""
+        """Remove and yield expired lines. A call yields at most 1,000, so that the caller can check for signals."""
         for _ in range(_MAX_EXPIRED_LINES):
             if not self.first or self.first.end > now:
                 break
@@ -161,7 +161,7 @@ class LineBuffer:
 
 
 def _read_available() -> bytes | None:
-    """Read from standard input, and return the data, b"" at its end, or None if no input is available yet."""
+    """Return data from standard input. It is b"" at the end of the input, and None if reading would block."""
     try:
         return os.read(0, _STDIN_READ_BYTES)
     except BlockingIOError:  # another program has made standard input non-blocking
@@ -349,7 +349,7 @@ class LineSpeaker:
         self._unanswered = handle, self._connection.begin(request, accepted)
 
     def _process_answer(self) -> None:
-        """If the last line has been answered, report its goal as accepted or rejected, and follow an accepted one."""
+        """If the server has answered the last line, report whether its goal was accepted. Follow an accepted goal."""
         if self._unanswered is None or not self._unanswered[1].over:
             return
         (handle, exchange), number = self._unanswered, self._sending or 0
@@ -392,7 +392,7 @@ class LineSpeaker:
     # Waiting for input and for the server
 
     def _wait_for_news(self) -> None:
-        """Wait for input, an answer or an event, until a line expires or time is up. Add any input to the buffer."""
+        """Wait for input, an answer or an event until the next deadline, and add any input to the buffer."""
         watched = self._interrupts.watched
         first = self._buffer.first
         end = min(first.end, self._end) if first and self._error is None else self._end

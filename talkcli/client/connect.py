@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 #: The beginning of the greeting of a server with the same protocol. A test compares it with a real greeting.
 GREETING_START = b'{"talk": 1, "version": '
-#: An idle server sends its greeting within this time. Longer waits must be interruptible.
+#: How long to wait for the greeting of an idle server. Longer waits must be interruptible.
 GREETING_WAIT_S = 0.2
 #: Maximum time for which `yield_processor` waits.
 _LONGEST_YIELD_S = 0.2

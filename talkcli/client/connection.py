@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
 #: Maximum number of bytes to receive at once.
 _RECEIVE_BYTES = 256 * 1024
-#: The pause between two attempts to reconnect. A thread without a socket checks as often whether another thread has
-#: reconnected.
+#: The pause between two attempts to reconnect. A thread without a socket also checks at this interval whether
+#: another thread has reconnected.
 _RECONNECT_PAUSE_S = 0.1
 
 
@@ -49,7 +49,7 @@ def checked_sender_name(name: str | None) -> str | None:
 
 
 def take_repeatedly(connection: Connection, take: Callable[[], _T], end: float | None) -> Iterator[_T]:
-    """Yield the results of `take` endlessly. Before each one, wait for the server until there is a result.
+    """Call `take` repeatedly, and yield its results. While there is no result, wait for the server.
 
     An empty result is yielded if `end` has passed or the connection has ended. Nothing more is received after `end`, so
     that a loop over the results ends even if the server keeps sending events.
@@ -267,7 +267,9 @@ class Connection(ClientCore):
         raise NotImplementedError
 
     def _step(self, timeout: float, interruptible: bool) -> None:
-        """Send what is due, wait up to `timeout` seconds for messages, and process them. Only one thread may call this.
+        """Send waiting requests, wait up to `timeout` seconds for messages, and process them.
+
+        Only one thread at a time may call this method.
 
         Raises:
             Interrupted: the wait is `interruptible`, and one of the interrupting descriptors is ready.
@@ -279,7 +281,7 @@ class Connection(ClientCore):
         raise NotImplementedError
 
     def _drop(self) -> None:
-        """Close this process's descriptors, but not those of the parent process."""
+        """Close this process's copies of the descriptors. A parent process keeps its own copies."""
         raise NotImplementedError
 
 
@@ -320,7 +322,7 @@ class SocketConnection(Connection):
         give_up = time.monotonic() + keep_trying
         attempt = connect(self._named, self._hello_message, patience, self._interrupt, attempt, keep_trying, end)
         self._patience = max(patience, round(give_up - time.monotonic(), 1))
-        #: None while disconnected
+        #: the socket, or None while disconnected
         self._socket: _socket.socket | None = attempt.socket
         self.path, self.boot, self.pid = attempt.path, attempt.boot, attempt.pid
         self._sent_early = attempt.request_sent
@@ -426,7 +428,7 @@ class ReconnectingConnection(SocketConnection):
         return super().begin(request, on_reply, on_failure)
 
     def break_off(self, why: str, now: float) -> None:
-        """Disconnect, and schedule an attempt to reconnect, unless the connection has ended for good."""
+        """Disconnect, and schedule an attempt to reconnect. Do nothing if the connection has ended for good."""
         if self.ended is not None:
             return
         was_greeted = self.greeted

@@ -1,12 +1,12 @@
 """The client's side of the protocol, without I/O.
 
 `ClientCore` turns requests into bytes, and received bytes into replies and events. A transport is a shell around it,
-which connects, and has the lock or the event loop. Its duties are:
+which connects, and has the lock or the event loop. The duties of a transport are:
 
 - Send the bytes that `outgoing()` returns, and report with `mark_sent()` how many were accepted.
 - Pass received bytes to `receive()`.
 - Call `expire()` at the time that `next_expiry()` returns, or earlier.
-- Call `end()` when the connection has ended for good, or `disconnected()` if the shell is going to connect again.
+- Call `end()` when the connection has ended for good, or `disconnected()` if it is going to reconnect.
 
 Rules for this file: no socket, thread, lock, asyncio or clock. Times are seconds of a monotonic clock, and are passed
 as arguments. The caller must make sure that only one thread at a time calls a method.
@@ -108,12 +108,12 @@ class EventListeners:
         self.watches: WeakSet[EventBuffer] = WeakSet()
 
     def add(self, tracked: TrackedGoal) -> None:
-        """Pass a goal's events and all pauses to this object, until the goal has ended or is lost."""
+        """Pass a goal's events and all pauses to `tracked`, until the goal has ended or is lost."""
         self._goals.setdefault(tracked.goal.id, set()).add(tracked)
 
     @property
     def goals(self) -> dict[str, bool]:
-        """The ids of all followed goals, and whether any follower of a goal receives words."""
+        """Maps the id of each followed goal to whether any of its followers receives words."""
         return {goal_id: any(each._with_feedback for each in some) for goal_id, some in self._goals.items()}
 
     def lose(self, goal_id: str, why: str) -> None:
@@ -139,7 +139,10 @@ class EventListeners:
                 self.watches.discard(buffer)
 
     def publish(self, event: Event | None) -> None:
-        """Pass an event to the goals that it concerns and to the readers that watch all goals. None is ignored."""
+        """Pass an event to the goals that it concerns and to the readers that watch all goals.
+
+        Events of an unknown kind are None, and are ignored.
+        """
         if isinstance(event, Result):
             for tracked in self._goals.pop(event.goal.id, set()):
                 tracked._update(event.goal)
@@ -194,7 +197,7 @@ class TrackedGoal:
             listeners.add(self)
 
     def _fail(self, error: TalkError) -> None:
-        """End the goal because `say` failed: as LOST if the goal may be spoken, and otherwise as REJECTED."""
+        """End the goal after a failed `say`: as LOST if it may still be spoken, otherwise as REJECTED."""
         from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
 
         if isinstance(error, Lost):
@@ -241,7 +244,7 @@ class TrackedGoal:
         return self.goal.state.terminal or bool(self._buffer)
 
     def _take(self) -> Event | None:
-        """Remove and return the oldest event, and the Result after the last one. Return None if nothing is new."""
+        """Remove and return the oldest event, or the Result after the last event. Return None if nothing is new."""
         return self._buffer.take() or (Result(self.goal) if self.goal.state.terminal else None)
 
 
@@ -393,7 +396,7 @@ class ClientCore:
         return sum(len(line) for line, _ in self._unsent) - self._first_sent_bytes
 
     def outgoing(self) -> bytes:
-        """Return the bytes that can be sent now: the hello line, or the requests once the server has greeted."""
+        """Return the bytes that can be sent now: the hello line or, after the server's greeting, the requests."""
         if self._hello or not self.greeted:
             return self._hello
         return b"".join(line for line, _ in self._unsent)[self._first_sent_bytes :]
@@ -462,7 +465,7 @@ class ClientCore:
         return Lost(words) if isinstance(request, self.lasting) else ServerUnavailable(words)
 
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
-        """Return the error that a refusing reply reports. `items` are the list items that came before the reply."""
+        """Return the error for a reply that refuses a request. `items` are the list items before the reply."""
         from talkcli.terminal.text import printable  # rarely needed, and slow to import
 
         error = reply.get("error")
@@ -518,7 +521,7 @@ class ClientCore:
     def split(self, data: bytes, now: float) -> list[bytes]:
         """Add received bytes, record their time, and return the lines that are now complete.
 
-        Shells that pass lines on undecoded use this method instead of `receive`.
+        Transports that pass lines on without decoding them use this method instead of `receive`.
         """
         self._heard = now
         return self._splitter.feed(data)
@@ -551,7 +554,7 @@ class ClientCore:
         return self.exchanges.get(number) if isinstance(number, int) else None
 
     def dispatch(self, message: JsonObject, now: float) -> Exchange | None:
-        """Process a received event, list item or reply, and return the exchange that it ends, or None.
+        """Process a received event, list item or reply. Return the exchange that a reply has ended, if any.
 
         Raises:
             ValueError: the event, or a goal in the reply, is malformed.
@@ -627,9 +630,9 @@ class ClientCore:
             self.fail(exchange, error)
 
     def connected(self, boot: str, pid: int | None, now: float) -> None:
-        """Record the greeting on a new connection, and follow goals again, or mark them LOST after a restart.
+        """Record the greeting on a new connection. Follow all goals again, or end them as LOST.
 
-        Goals are followed again if this is still the same run of the server. Otherwise they are LOST.
+        Goals are followed again if the server wasn't restarted in the meantime. Otherwise they are LOST.
 
         Args:
             boot: the boot id in the greeting. Each start of the server has another one.
@@ -666,7 +669,7 @@ class ClientCore:
                     self.listeners.update(goal)
 
         def on_failure(error: TalkError) -> None:
-            if self.absent_since is None:  # if the connection broke again, the goal is followed on the next one
+            if self.absent_since is None:  # after another break, the next connection follows the goal
                 self.listeners.lose(goal_id, f"{error.message}; the sentence may have been spoken")
 
         self._begin(Exchange(Wait((goal_id,), feedback), on_reply, on_failure), now)
@@ -698,7 +701,7 @@ class ClientCore:
             exchange.on_failure(error)
 
     def _fail_all(self) -> None:
-        """Fail all unanswered requests, and send nothing more of them."""
+        """Fail all unanswered requests, and discard their unsent bytes."""
         self._drop_unsent_lines()
         for exchange in list(self.exchanges.values()):
             self.fail(exchange, self.unanswered(exchange))

@@ -102,10 +102,10 @@ class GoalHandle(TrackedGoal):
         return (each for each in self._iterate_events(end, timeout) if isinstance(each, WordHeard))
 
     def poll(self) -> Event | None:
-        """Read from the server without blocking, and return the goal's next event, or None. The Result comes last.
+        """Read from the server without blocking. Return the goal's next event, or None if there is none.
 
-        Call this method regularly, because each call also receives the events of other goals, and sends the rest of
-        earlier requests.
+        The Result is the last event. Call this method regularly, because each call also receives the events of other
+        goals, and sends the rest of earlier requests.
 
         Raises:
             UsageError: the goal was sent with `follow=False`, and neither `wait` nor `events` has been called.

@@ -41,7 +41,7 @@ class RateLimit:
         self._event_count = 0
 
     def count_event(self, now: float) -> int | None:
-        """Count an event. Return how many events were suppressed before it, or None to suppress it, too.
+        """Count an event. Return how many events were suppressed before it, or None if it must be suppressed.
 
         If the event is allowed, return how many events have been suppressed since the last allowed event.
         """

@@ -172,7 +172,7 @@ class BrokerExamination:
         return warning("anonymous", words, "allow_anonymous false in mosquitto.conf; then: talk bridge --print-acl")
 
     def _test_rights(self, link: Link, user: str) -> tuple[Finding, dict[str, Presence]]:
-        """Publish messages to test the user's rights. Return the finding about them, and robots' presences by name.
+        """Publish messages to test the user's rights. Return the finding, and the presences of robots by name.
 
         The user needs the rights of an operator, or those of this robot's bridge. Other robots are only read if this
         robot's presence is missing, and the user isn't the robot.

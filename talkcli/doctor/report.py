@@ -43,7 +43,7 @@ class Finding:
 
 @frozen
 class Question:
-    """A question of an examination, with the text of each possible answer."""
+    """The question that an examination answers, with the text of each possible answer."""
 
     #: the human-readable answers
     yes: str

@@ -132,7 +132,7 @@ def _goal_result(goal: Goal) -> SentenceResult:
 
 
 def speak_beside_server(client: Client, options: EngineOptions, limit: float) -> SentenceResult:
-    """Play a silent sentence with the doctor's own engine. Return how it ended, and whether the server spoke."""
+    """Play a silent sentence with the doctor's own engine. Return how it ended, and whether the server also spoke."""
     try:
         before = client.status()
         result = speak_by_engine(SILENT_TEXT, options, 0.0, limit)

@@ -83,7 +83,7 @@ class SocketPlace:
 
 
 def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Client | None, Finding]:
-    """Connect to the server. Return the client, or None, and the finding about the server's socket.
+    """Connect to the server. Return the client, if connected, and the finding about the server's socket.
 
     The client is None if no connection was possible.
 
@@ -236,7 +236,7 @@ def judge_server(server: JsonObject, log: Sequence[Goal], now: float) -> list[Fi
 
 
 def _judge_state(server: JsonObject) -> Finding:
-    """Return the finding about whether a server is paused, its engine works, and its version is the installed one."""
+    """Return the finding about a server's state: whether it is paused, its engine and its version."""
     version, words = server.get("version"), summarize_server(server)
     if server.get("paused") is True:
         return failure("server", f"speech is paused; {words}", "talk resume")
@@ -258,7 +258,7 @@ def summarize_server(server: JsonObject) -> str:
 
 
 def _judge_settings(server: JsonObject) -> Finding:
-    """Return the finding about a server's settings. It is not ok if the volume is too low."""
+    """Return the finding about a server's settings. It is a warning or failure if the volume is too low."""
     volume = server.get("volume")
     lead_in = [f"lead-in {server['lead_in']} ms"] if server.get("lead_in") else []
     words = ", ".join([*describe_settings(server), *lead_in])

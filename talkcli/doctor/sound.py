@@ -69,7 +69,7 @@ _MAX_OUTPUT_BYTES = 64 * 1024
 
 @frozen
 class UserSession:
-    """The user and session of a process, which is the server or this process."""
+    """The user and session of the server's process or of this process."""
 
     uid: int
     user: str
@@ -327,7 +327,7 @@ DEVICE_LISTS: dict[str, tuple[str, Callable[[ProgramOutput], Iterable[str]], str
 
 
 def add_pactl_hint(finding: Finding, env: Mapping[str, str]) -> Finding:
-    """Return a finding, with a hint on how to install pactl if its advice uses pactl and pactl is missing."""
+    """Return a finding. If its advice uses pactl and pactl is missing, add a hint on how to install pactl."""
     if finding.next is None or "pactl " not in finding.next or on_path("pactl", env):
         return finding
     return replace(finding, next=f"{finding.next} (to install pactl: sudo apt-get install -y {PACKAGES['pacat']})")

@@ -255,7 +255,7 @@ def _find_package_fault(env: Mapping[str, str]) -> tuple[str, str] | None:
         return _split_advice(missing)
     env = {**env, **models.PACKAGE_VARIABLES}
     fault = None
-    for package in install.NEURAL_PACKAGES:  # the first one imports numpy, which may be the one that doesn't work
+    for package in install.NEURAL_PACKAGES:  # the first package imports numpy, which may be the faulty one
         output = run_program(sys.executable, "-c", _IMPORT_PROGRAM + package, env=env, limit=_IMPORT_LIMIT_S)
         if output.error is None:
             break
@@ -299,7 +299,7 @@ def _try_voice(voice: str, options: EngineOptions, limit: float) -> VoiceTrial:
 
 
 def _speak(engine: PrivateEngine, voice: str, text: str) -> tuple[protocol.Ended, float | None]:
-    """Speak a text. Return how it ended, and how long the voice took to load, or None if it was loaded before."""
+    """Speak a text, and return how it ended. Also return the voice's loading time, or None if it was already loaded."""
     load_s = None
     # Set `voice_only`, because otherwise espeak would speak if the voice isn't loaded.
     engine.speak(protocol.Speak(text, text, SENTENCE_RATE_WPM, 1.0, voice, 50, voice_only=True))

@@ -209,14 +209,14 @@ class DriverProperties:
         self._voice = wanted
 
     def find_voice_id(self, wanted: str) -> str:
-        """Return the ID of the voice that best matches the user's input.
+        """Return the ID of the voice that best matches the user's input, or raise CannotSpeak.
 
         Raises:
             CannotSpeak: there is no such voice.
         """
         found = voices.find_voice(wanted, self._voices)
         if found is not None and is_neural(found.id) and without_speaker(wanted) != without_speaker(found.id):
-            found = None  # not an exact match, and a voice installed since then may match better
+            found = None  # the match isn't exact, and a voice that was installed later may match better
         if found is None:  # listing the voices takes some milliseconds, so it is only done if necessary
             self._voices = voices.list_voices(self._engine)
             found = voices.find_voice(wanted, self._voices)
@@ -226,9 +226,10 @@ class DriverProperties:
         return found.id
 
     def _set_property(self, name: str, value: Any, setting: str) -> None:
-        """Set a property of the engine. In error messages, `setting` names the property and its value.
+        """Set a property of the engine, or raise CannotSpeak.
 
-        pyttsx3 reports errors through notifications. This method raises them as exceptions.
+        pyttsx3 reports errors through notifications. This method raises them as exceptions. In the messages,
+        `setting` names the property and its value.
 
         Raises:
             CannotSpeak: the property can't be set.

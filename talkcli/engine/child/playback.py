@@ -46,8 +46,8 @@ EARLY_END_LIMIT_S = 0.25
 DEVICE_BUSY_LIMIT_S = 1.0
 DEVICE_RETRY_INTERVAL_S = 0.05
 
-#: Maximum length of the zero samples to skip at the beginning of a sentence. libespeak-ng produces 0 to 11 ms of zeros.
-#: Longer silence is intentional, for example at volume 0.
+#: Maximum duration of the zero samples to skip at the beginning of a sentence. libespeak-ng produces 0 to 11 ms of
+#: zeros. Longer silence is intentional, for example at volume 0.
 LEADING_ZEROS_LIMIT_S = 0.1
 
 #: Time allowed for a killed player to exit. It usually takes 1 ms, unless the player hangs in a device driver.
@@ -104,7 +104,7 @@ class SentenceSamples:
         return self.begin + len(self._kept)
 
     def add(self, samples: bytes) -> None:
-        """Add samples at the end, and update what is known about sound and silence in the sentence."""
+        """Append samples, and update `audible` and the length of the silence at the end."""
         self._kept += samples
         self.audible = self.audible or samples.count(0) != len(samples)
         backwards = reversed(array("h", samples))
@@ -161,7 +161,7 @@ class PlayerFeed:
         clock.reset(begin)
 
     def offer(self, samples: memoryview) -> int:
-        """Offer samples to the player, and return the number of bytes accepted. The first ones start the clock."""
+        """Offer samples to the player, and return the number of bytes accepted. The first samples start the clock."""
         taken = self.player.offer(samples)
         if taken:
             now = time.monotonic()
@@ -189,7 +189,7 @@ class PlayerFeed:
         """Adjust the clock to the player's progress. Set `complete` if nothing more will be written."""
         consumed = self.player.consumed()
         if consumed > self.consumed:
-            if self.consumed == 0:  # the device has been opened; until then, samples wait in the player's pipe
+            if self.consumed == 0:  # the device has just been opened; before that, samples wait in the player's pipe
                 self._clock.start(now)
             self.consumed = consumed
             if consumed >= self.written:  # consuming a few bytes now and then doesn't count as progress
@@ -205,7 +205,7 @@ class PlayerFeed:
         return max(0.0, self.time_left(self.written, now))
 
     def time_left(self, byte_count: int, now: float) -> float:
-        """Return how many seconds it takes until this many bytes of the stream have been heard.
+        """Return the time in seconds until the first `byte_count` bytes of the stream have been heard.
 
         The result is negative if they have already been heard.
         """
@@ -374,9 +374,9 @@ class Playback:
     # -- choosing a player
 
     def _with_player(self, step: Callable[[PlayerFeed], None]) -> None:
-        """Call `step` with the current player. If that player fails or was released, repeat it with the next.
+        """Call `step` with the current player. If the player fails or was released, call `step` with the next player.
 
-        It is repeated if the player fails before any sound was heard, or if the player was released during a pause.
+        The call is repeated if the player fails before any sound was heard, or was released during a pause.
         """
         while True:
             self._raise_if_stopped()
@@ -433,7 +433,7 @@ class Playback:
         return time.monotonic() < self._busy_until
 
     def _release_player(self, next_begin: int) -> None:
-        """Kill the player, and start over with the best one. It continues at the offset `next_begin`."""
+        """Kill the player. The best player then continues the sentence at the offset `next_begin`."""
         self._begin = self._sent = next_begin
         self._untried = self._first_error = None
         self.silence()

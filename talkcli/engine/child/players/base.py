@@ -77,7 +77,7 @@ class Player(Protocol):
         return None
 
     def offer(self, data: memoryview) -> int:
-        """Accept as many samples as there is room for.
+        """Accept as many samples as there is room for, and return the number of bytes accepted.
 
         Args:
             data: Between one byte and one piece of samples. The caller reuses this buffer after the call.
@@ -126,7 +126,7 @@ class Player(Protocol):
         """
 
     def wake_at(self) -> float:
-        """Return the monotonic time at which to check the player again, or NEVER if its descriptors are enough."""
+        """Return the monotonic time at which to check the player again, or NEVER if polling is enough."""
 
     def kill(self) -> None:
         """Stop playing at once, and start to release all resources.

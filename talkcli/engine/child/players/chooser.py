@@ -41,7 +41,7 @@ MAX_HANDOVERS = 5
 #: sentences stay separate.
 MAX_CUT_S = 0.12
 
-#: Handovers that take more than this many seconds aren't counted. In these cases, the waiting goal was canceled or
+#: Handovers that take more than this many seconds aren't counted. In these cases, the waiting goal was cancelled or
 #: paused, and another goal followed later.
 MAX_HANDOVER_S = 0.5
 
