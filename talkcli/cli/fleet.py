@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def fleet(options: CommonOptions, what: str, long: bool) -> int | None:
-    """Show the state of each selected robot or, if `what` is "watch", their events until interrupted.
+    """Show the state of each selected robot or, if `what` is "watch", show events until interrupted.
 
     Return the exit code, or None for success.
     """

@@ -63,7 +63,7 @@ class GoalReporter:
             self.feedback.note("speech is paused; continue with: talk resume")
 
     def follow(self, goals: Sequence[GoalHandle], timeout: float | None) -> None:
-        """Wait until these goals have ended, and show their events.
+        """Show the events of these goals until they have ended. Raise TimeoutError if they don't end in time.
 
         Raises:
             TimeoutError: the goals haven't ended in time.

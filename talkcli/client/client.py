@@ -272,7 +272,7 @@ class Client:
         return ServerStatus.from_reply(*self._connection.request(Status()))
 
     def goal(self, goal_id: str) -> Goal:
-        """Return the current state of a goal.
+        """Return a goal in its current state, or raise UnknownGoal.
 
         Raises:
             UsageError: the id is empty.

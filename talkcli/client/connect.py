@@ -197,7 +197,7 @@ def connect(
     keep_trying: float = 0.0,
     end: float | None = None,
 ) -> ConnectionAttempt:
-    """Connect to the first usable server, trying again for a limited time, and read its greeting.
+    """Connect to the first usable server, read its greeting, and return the attempt. Retry for a limited time.
 
     Args:
         named: path of the only socket to try; None for the usual places.

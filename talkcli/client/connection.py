@@ -194,7 +194,7 @@ class Connection(ClientCore):
         since: float | None = None,
         interruptible: bool = True,
     ) -> bool:
-        """Read and process messages until `done()` is true, the deadline passes, or the connection ends.
+        """Process messages until `done()` is true. Return False if the deadline passes or the connection ends first.
 
         If the server is silent for too long, the connection ends.
 

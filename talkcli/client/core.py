@@ -503,7 +503,7 @@ class ClientCore:
         return min(times, default=float("inf"))
 
     def expire(self, now: float) -> bool:
-        """Fail requests that have reached their time limit, and end goals as LOST after a long disconnection.
+        """Fail late requests, and end goals after a long disconnection. Return False if the connection must be closed.
 
         Returns:
             False if the connection must be closed, because a part of a line has been sent (see `forget`).

@@ -52,7 +52,7 @@ class GoalHandle(TrackedGoal):
         return self.goal.state
 
     def wait(self, timeout: float | None = None) -> Goal:
-        """Wait until the goal has ended, and return it.
+        """Wait until the goal has ended, and return it. Raise TimeoutError if `timeout` expires first.
 
         If the goal can no longer be followed, for example because the server was restarted, the goal ends as LOST. It
         may or may not have been spoken.

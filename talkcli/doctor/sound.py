@@ -340,7 +340,7 @@ def suspended_sinks(env: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def find_sound_server(env: Mapping[str, str], session: UserSession) -> SoundServer:
-    """Find out which sound server the players of this session connect to, or why none answers."""
+    """Return facts about the sound server that this session's players connect to, or why none answers."""
     pulse = run_program("pactl", "info", env=env)
     if pulse.error is None:
         fields = dict(re.findall(r"^\s*([\w ]+): (.*\S)", pulse.stdout, re.MULTILINE))

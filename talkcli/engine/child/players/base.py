@@ -113,7 +113,7 @@ class Player(Protocol):
         """
 
     def ended(self) -> bool:
-        """Return whether the player was closed and has played everything successfully.
+        """Return whether the player was closed and has played everything. Raise CannotSpeak if it has failed.
 
         Raises:
             CannotSpeak: The player failed. This is also raised before `close`, even if no samples are offered.

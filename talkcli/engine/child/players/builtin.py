@@ -89,7 +89,7 @@ class NullPlayer(BuiltInPlayer):
         self._end_time = 0.0
 
     def offer(self, data: memoryview) -> int:
-        """Accept all of the samples if the simulated buffer has room for them, otherwise none."""
+        """Accept all samples if the simulated buffer has room, otherwise none. Return the number of bytes accepted."""
         now = self._clock()
         end = max(now, self._end_time) + len(data) / self._bytes_per_second
         if end > now + NULL_AHEAD_S:
