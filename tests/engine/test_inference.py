@@ -161,7 +161,7 @@ def test_damaged_cached_halves_are_made_again(tmp_path: Path, damage: bytes | No
         (tiny_voice.model()[:-200], {}, "is truncated"),
         (tiny_voice.model(nodes=tiny_voice.node("Evil", ["input"], "x", domain="evil")), {}, "custom operators"),
         (tiny_voice.model(weights=tiny_voice.weight("w", [1], 1, more=OUTSIDE)), {}, "its weights in another file"),
-        (tiny_voice.model(amplitude=float("nan")), {}, "not numbers"),
+        (tiny_voice.model(amplitude=float("nan")), {}, "invalid samples"),
         (tiny_voice.model(sound_frames=1e4), {}, "more than 200 frames for 5 phonemes"),
         (tiny_voice.model(sound_frames=1e12), {}, "there is not enough memory; end another program"),
         (tiny_voice.model(hop=5000), {}, "not a Piper model .it makes [0-9]+ samples for"),
