@@ -145,7 +145,7 @@ _ERRORS_BY_CODE: dict[str, type[RequestRefused]] = {
 
 
 def refusal(code: str, message: str, items: list[dict[str, object]] | None = None) -> RequestRefused:
-    """Return the exception for the error code in a server's reply, which is a RequestRefused or a subclass."""
+    """Return the exception for an error code from the server: a RequestRefused or a subclass of it."""
     return _ERRORS_BY_CODE.get(code, RequestRefused)(message, code, items)
 
 

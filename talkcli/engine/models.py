@@ -132,7 +132,7 @@ def read_description(path: str) -> VoiceDescription:
 
 
 def open_checked(path: str, missing: str = "restore it", model: str = "") -> Any:
-    """Open a binary file for reading, but only if no other user can change it.
+    """Open a binary file for reading. Raise VoiceFileError if another user could change it.
 
     Args:
         path: The path of the file.

@@ -177,7 +177,7 @@ def player_commands(player: str | None, device: str | None, rate: int, last: str
 
 
 def _parse_custom_command(player: str, device: str | None, rate: int) -> PlayerCommand:
-    """Return a custom player command with its placeholders filled in. Its program must be installed."""
+    """Return a custom player command with its placeholders filled in. Raise PlayerMissing if it can't be run."""
     import shlex
 
     try:

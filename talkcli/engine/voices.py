@@ -64,7 +64,7 @@ def list_voices(engine: Any) -> tuple[Voice, ...]:
 
 
 def find_voice(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> Voice | None:
-    """Find a voice by name. Return None if no voice matches, or more than one.
+    """Find a voice by name. Return None if there is no match, or more than one.
 
     The name is compared with the ids, the last parts of the ids, the names and the languages of the voices, in this
     order, ignoring case. It may end with a variant ("en-us+f3"). The returned voice's id includes the variant. If
@@ -108,7 +108,7 @@ def _matching_voices(wanted: str, voices: tuple[Voice, ...], preferred: str | No
 
 
 def _possible_names(wanted: str, voices: tuple[Voice, ...]) -> Iterator[list[str]]:
-    """Yield the name that the user typed, and then similar names, as lists from most to least likely."""
+    """Yield lists of names to try, most likely first: the name that the user typed, and then similar names."""
     yield [wanted]
     name, mark, speaker = wanted.partition(SPEAKER_MARK)
     word = _fold(name)

@@ -119,7 +119,10 @@ class Fleet:
         return self._send_request(to, Wait(None if ids is None else tuple(ids)))
 
     def status(self, to: str) -> FleetRequest:
-        """Request the status of each robot's server. Each outcome contains its status as `said["status"]`."""
+        """Request the status of each robot's server. Return the request, which yields the outcomes.
+
+        Each outcome contains the status as `said["status"]`.
+        """
         return self._send_request(to, Status())
 
     def pause(self, to: str) -> FleetRequest:
@@ -131,9 +134,9 @@ class Fleet:
         return self._send_request(to, Resume())
 
     def set(self, to: str, **settings: Any) -> FleetRequest:
-        """Change the settings of each robot's server, if its bridge allows it. Return the request with the outcomes.
+        """Change the settings of each robot's server. Return the request, which yields the outcomes.
 
-        The arguments are those of `Client.set`.
+        If a robot's bridge doesn't allow this, its outcome is REFUSED. The arguments are those of `Client.set`.
         """
         return self._send_request(to, Set(**settings))
 

@@ -70,7 +70,7 @@ class Channel:
             self.closed = True
 
     def receive(self) -> list[protocol.Command]:
-        """Wait for data, and return the commands that have arrived completely. At the end, set `closed`."""
+        """Wait for data, and return all complete commands. If the server has closed the connection, set `closed`."""
         try:
             data = os.read(self.descriptor, 65536)
         except ConnectionResetError:
@@ -90,7 +90,7 @@ class ActiveGoal:
         self.words = WordFinder(command.text)
         #: time at which the driver last received text
         self.resumed_at = now
-        #: seconds of speech before that, if a third-party driver was paused
+        #: seconds of speech before `resumed_at`, if a third-party driver was paused
         self.spoken_s = 0.0
         #: time at which the driver last received text or reported a word
         self.progress_at = now
@@ -347,7 +347,7 @@ class GoalRunner:
             self._goal.error = exception
 
     def _handle_driver_finished(self, name: str | None, completed: bool, **_: object) -> None:
-        """End the current goal after the driver has finished its text, unless it was interrupted by a pause."""
+        """End the current goal after the driver has finished the text, unless a pause interrupted the driver."""
         goal = self._goal
         if goal is None or name != goal.id:  # the notification is for an earlier goal
             return
@@ -381,7 +381,7 @@ class GoalRunner:
         self._channel.send(ended)
 
     def _alive_due(self) -> float:
-        """Return the time at which to send the next `Alive`, or NEVER if none is due or the driver hangs."""
+        """Return when to send the next `Alive`, or NEVER if the process is idle or the driver hangs."""
         loader = self._synthesizer.loader if self._synthesizer else None
         loading = loader is not None and loader.descriptor is not None
         if not loading and (self._goal is None or self._notice_overdue(self._goal)):
@@ -389,7 +389,7 @@ class GoalRunner:
         return self._channel.sent_at + protocol.ALIVE_INTERVAL_S
 
     def _notice_overdue(self, goal: ActiveGoal) -> bool:
-        """Return whether a third-party driver has taken longer than the text can need, and log it once.
+        """Return whether a third-party driver takes too long for the text. Log this once for each goal.
 
         The process then sends no `Alive`, so that the server kills it. There may be no other way to stop the driver.
         """

@@ -109,7 +109,7 @@ class WordClock:
         self._waiting.append(word)
 
     def skip_until(self, position: float) -> None:
-        """Move all words before this position to it, because the audio before it is skipped."""
+        """Move all earlier words to this position, because the audio before it is skipped."""
         self._waiting = deque(replace(each, position=max(position, each.position)) for each in self._waiting)
 
     def reset(self, position: float) -> None:

@@ -111,9 +111,9 @@ class EngineProcess:
             return False
 
     def receive(self) -> Iterator[protocol.Event | None]:
-        """Yield the events that have arrived, without blocking.
+        """Yield the events that have arrived, without blocking. The last one is None if the connection has ended.
 
-        The last event is None if the process has closed the connection or sent a malformed message.
+        A malformed message counts as the end of the connection.
         """
         try:
             data = self.socket.recv(65536)

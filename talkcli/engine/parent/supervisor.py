@@ -166,7 +166,7 @@ class SupervisedGoal:
     stop_due: float = NEVER
     #: number of the current pause; None if the goal is not paused
     hold_number: int | None = None
-    #: time by which the process must confirm a `Hold`; NEVER if none is unconfirmed
+    #: time by which the process must confirm a `Hold`; NEVER if none is waiting for confirmation
     hold_due: float = NEVER
     #: event that will be posted once `lost_process` has exited
     end: protocol.Ended | None = None
@@ -212,7 +212,7 @@ class Supervisor:
         self._actions.call(lambda: self._begin_goal(command))
 
     def stop(self, goal_id: str) -> None:
-        """Stop the goal."""
+        """Stop the goal. Its `Ended` is posted once it has stopped."""
         self._actions.call(lambda: self._stop_goal(goal_id))
 
     def pause(self, goal_id: str, number: int) -> None:
@@ -224,7 +224,7 @@ class Supervisor:
         self._actions.call(lambda: self._hold_goal(goal_id, None))
 
     def announce_next(self, goal_id: str, next_waits: bool, next_is_neural: bool) -> None:
-        """Tell the process whether another goal is waiting behind this one.
+        """Tell the process whether another goal is waiting after the current one.
 
         If so, the process shortens the silence between the two. A message that can't be sent is dropped, because it
         isn't important.
@@ -351,10 +351,7 @@ class Supervisor:
             self._loading, self._last_sign_at = voice, time.monotonic()
 
     def _send(self, command: protocol.Command) -> bool:
-        """Send a command if the process is ready, and return whether it was sent. Replace a process that refuses it.
-
-        A process that doesn't accept the command is replaced.
-        """
+        """Send a command if the process is ready, and return whether it was sent. Replace a process that refuses it."""
         process = self._process
         if process is None or not process.ready:
             return False

@@ -66,10 +66,7 @@ class LocalConnection(ClientCore):
         self.connected(boot, pid, self._loop.time())
 
     async def read(self) -> list[bytes]:
-        """Wait for lines, and return them without their newlines.
-
-        If the connection has ended, return an empty list.
-        """
+        """Wait for lines, and return them without newlines. If the connection has ended, return an empty list."""
         while not self._lines:
             await asyncio.sleep(0)  # let other tasks run even if data is always available
             try:
@@ -95,7 +92,7 @@ class LocalConnection(ClientCore):
         return True
 
     def close(self) -> None:
-        """Close the connection. If a `read` is waiting, first cancel it or end it with `abort`.
+        """Close the connection. A waiting `read` must first be canceled, or ended with `abort`.
 
         The server cancels the requests that it has not answered, if possible.
         """
@@ -128,7 +125,7 @@ class LocalConnection(ClientCore):
 
 
 async def dial(socket: str | None, name: str, *, urgent: bool = False) -> LocalConnection:
-    """Connect to the server, try again while it is busy, and return the connection after the server's greeting.
+    """Connect to the server, and return the connection after the greeting. Keep trying while the server is busy.
 
     Args:
         socket: path of the server's socket, or None for the default locations.

@@ -356,7 +356,7 @@ class Bridge:
             log.write_bug("a message from the broker", error)
 
     def _handle_message(self, message: Message) -> None:
-        """Process an echo, a presence message or a client's request, which the broker has delivered."""
+        """Process an echo, a presence message or a client's request from the broker."""
         if message.topic == self._echo_topic:
             self._handle_echo(message.payload)
             return
@@ -398,7 +398,7 @@ class Bridge:
             self._policy.record_echo(sent_at, boottime())
 
     def _handle_presence(self, payload: bytes) -> None:
-        """Find out from a presence message whether another bridge has this robot's name. The younger bridge ends.
+        """Check a presence message for another bridge with this robot's name. The younger of the two bridges ends.
 
         It may come from this bridge, an earlier one, or another one with the same robot name.
         """

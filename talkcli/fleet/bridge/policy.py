@@ -124,14 +124,14 @@ class Policy:
         self.newest_echo_at = 0.0
 
     def record_echo(self, sent_at_text: bytes, now: float) -> None:
-        """Record that an echo has returned. Ignore it if it has an invalid time, or one after `now`."""
+        """Record that an echo has returned. Ignore it if its time is invalid or later than `now`."""
         with contextlib.suppress(ValueError):
             sent_at = float(sent_at_text)
             if self.newest_echo_at < sent_at <= now:
                 self.newest_echo_at = sent_at
 
     def decide(self, message: Message, kind: str, user: str, now: float) -> RemoteRequest | Refusal | Goodbye | Ignored:
-        """Decide whether to accept, refuse or ignore a message, or to end its client's session.
+        """Return the decision to accept, refuse or ignore a message, or to end its client's session.
 
         Args:
             message: a message on a request topic of the robot or one of its groups.
@@ -213,7 +213,7 @@ class SentIds:
         return self._sent.get(goal_id) == (boot, True)
 
     def add(self, goal_id: str, boot: str, *, counted: bool = True) -> None:
-        """Record that a goal was sent to the server with this boot id. Forget the oldest one if there are too many."""
+        """Record that a goal was sent to the server with this boot id. Forget the oldest goal if there are too many."""
         self._sent.pop(goal_id, None)
         self._sent[goal_id] = boot, counted
         if len(self._sent) > MAX_REMEMBERED_IDS:

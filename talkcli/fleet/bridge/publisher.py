@@ -154,7 +154,7 @@ class Publisher:
         self._set_server(about, status, server.boot)
 
     def _set_server(self, about: JsonObject | None, status: ServerStatus, boot: str) -> None:
-        """Replace the state of the server and its goals, and report the change. `about` is the new `server`."""
+        """Store a new state of the server and its goals, and report the change. `about` replaces `server`."""
         self.server = about
         self._active = status.active.id if status.active else None
         self._texts = {each.id: _shown_text(each) for each in unfinished(status)}

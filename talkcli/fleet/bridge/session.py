@@ -88,7 +88,7 @@ class RemoteSessions:
         self._loop = asyncio.get_running_loop()
         self._sessions: dict[tuple[str, str | None], RemoteSession] = {}
         self._release_handle: asyncio.Handle | None = None
-        #: the client that has canceled pending goals since `_release` last ran; None if none has
+        #: the client that has canceled pending goals since `_release` last ran; None if no client has
         self._canceled_by: By | None = None
 
     # -- from the broker
@@ -115,7 +115,10 @@ class RemoteSessions:
         self.may_read.set()
 
     def tick(self) -> None:
-        """Every few seconds, end silent clients' sessions, and send signs of life to clients with waiting goals."""
+        """End silent clients' sessions, and send signs of life to clients with waiting goals.
+
+        Call this every few seconds.
+        """
         now = self._loop.time()
         for session in list(self._sessions.values()):
             if now - session.used_at > CLIENT_SILENCE_LIMIT_S:
@@ -149,14 +152,14 @@ class RemoteSessions:
         return sum(each.size_bytes for session in self._sessions.values() for each in session.unanswered)
 
     def cancel_waiting(self, selection: Cancel, canceled_by: By | None) -> list[Goal]:
-        """Cancel the goals that match a `cancel` request while they wait in the bridge, and return them."""
+        """Cancel the goals waiting in the bridge that match a `cancel` request, and return them."""
         selected = [self.waiting[each] for each in selection.select_waiting([say for _, say, _ in self.waiting])]
         self.waiting = [each for each in self.waiting if not any(each is other for other in selected)]
         ending = State.RECALLED, "canceled", "not spoken: it was cancelled first", canceled_by
         return [session.end_goal(request, say, *ending) for request, say, session in selected]
 
     def handle_pending_change(self) -> None:
-        """Call `on_change`, and if any goals are waiting, schedule a call of `_release`.
+        """Call `on_change`, and schedule a call of `_release` if any goals are waiting.
 
         Call this whenever the number of pending goals may have changed. Events that were received together are all
         processed before goals are released.
@@ -179,7 +182,7 @@ class RemoteSessions:
     # -- from the watch of the server
 
     def handle_goal_change(self, event: StateChanged, boot: str) -> None:
-        """Update the pending goals after a state change, which was reported by the server with this boot id."""
+        """Update the pending goals after a state change reported by the server with this boot id."""
         goal = event.goal
         if event.state is not State.PENDING:
             counted = self.goals.remove(event.id)
@@ -190,7 +193,7 @@ class RemoteSessions:
         self.handle_pending_change()
 
     def remember(self, goal: Goal, boot: str) -> None:
-        """Remember the id of a remote client's goal, which an earlier bridge process may have sent.
+        """Remember the id of a remote client's goal, in case an earlier bridge process sent it. Ignore other goals.
 
         The goal counts towards the limit even if it was sent with `preempt`, because the server doesn't report that.
         """
@@ -333,7 +336,7 @@ class RemoteSession:
     # -- to the server
 
     def _send_request(self, remote: RemoteRequest) -> None:
-        """Send a client's request to the server. A goal may have to wait, and a cancel first ends waiting goals."""
+        """Send a client's request to the server. Goals may have to wait, and `cancel` first cancels waiting goals."""
         request = remote.request
         if isinstance(request, Say):
             self.send_say(remote, request)
@@ -370,7 +373,7 @@ class RemoteSession:
             shared.waiting.append((remote, say, self))
         else:
             words = f"{policy.MAX_REMOTE_GOALS} goals of remote clients are already waiting"
-            # As at the server, a rejected goal doesn't get the id that its client has chosen.
+            # Like the server, don't give a rejected goal the id that its client has chosen.
             self.end_goal(remote, replace(say, id=None), State.REJECTED, "queue_full", f"not spoken: {words}")
 
     def _send_cancel(self, remote: RemoteRequest, cancel: Cancel) -> None:

@@ -98,7 +98,7 @@ class DeskLink:
 
     @property
     def retained_received(self) -> bool:
-        """Whether the retained messages have arrived, because the marker after them came back some time ago."""
+        """Whether all retained messages count as received. They do shortly after the marker message has arrived."""
         return self.marker_at is not None and time.monotonic() > self.marker_at + RETAINED_GRACE_S
 
     def reply_topic(self, robot: str) -> str:
@@ -137,7 +137,7 @@ class DeskLink:
         return descriptor in ready
 
     def _receive(self, message: Message) -> None:
-        """Pass a message to the handler. If it is the marker after the retained messages, record that it arrived."""
+        """Pass a message to the handler. If it is the marker message, record the time of its arrival instead."""
         if message.topic == self.reply_topic(topics.MARKER):
             self.marker_at = time.monotonic()
         else:
@@ -217,7 +217,7 @@ class DeskLink:
             self._wake_writer.send(b"\0")
 
     def flush(self, timeout: float) -> None:
-        """Poll until the broker has acknowledged all messages, but at most for `timeout` seconds."""
+        """Poll until the broker has acknowledged all messages, but for at most `timeout` seconds."""
         end = time.monotonic() + timeout
         while self.link is not None and self.link.outstanding_bytes and (left := end - time.monotonic()) > 0:
             self.poll(left)

@@ -53,7 +53,7 @@ class RobotExchange(Exchange):
 
     #: how many times the request has been sent again
     resends = 0
-    #: when the sentence expires (in `boottime`), or None if it never does
+    #: when the sentence expires (by the `boottime` clock), or None if it never does
     latest: float | None = None
 
 
@@ -125,7 +125,7 @@ class RobotConnection(Connection):
             self._desk.wake()  # The request will be sent when the robot is back.
 
     def expect_reply(self, exchange: RobotExchange) -> None:
-        """Register an exchange to receive its answer, because its request was sent to the robot's group."""
+        """Register an exchange whose request was sent to the robot's group, so that it receives the answer."""
         exchange.sent = True
         self._published_at = time.monotonic()
         self.register(exchange, self._published_at)

@@ -146,7 +146,10 @@ class PlayerChooser:
         self.handovers.next_waits, self.handovers.next_is_neural = command.next_waits, command.next_is_neural
 
     def update_output(self, player: Player) -> None:
-        """Record a player's output and, if it works, its name. A sentence that was ever muted counts as muted."""
+        """Record the output of a player. If the player was chosen automatically and works, also record its name.
+
+        A sentence that was ever muted counts as muted.
+        """
         if player.proven and self._configure.player is None:
             self.last_player = player.name
         output, before = player.output, self.output
@@ -204,5 +207,5 @@ def _open_in_process(name: str, rate: int, device: str | None = None, audible: b
 
 
 def _raise_error(error: CannotSpeak) -> Player:
-    """Raise the error. This takes the place of a function that opens a player."""
+    """Raise an error instead of opening a player."""
     raise error

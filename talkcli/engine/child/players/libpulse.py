@@ -195,7 +195,7 @@ class MainLoop:
         return not self.freed and bool(self._library.mainloop_iterate(self._pointer, 1, None) > 0)
 
     def free(self) -> None:
-        """Free the loop, after its contexts have been released."""
+        """Free the loop. Its contexts must be released first."""
         self._library.mainloop_free(self._pointer)
         self.freed, self.interests, self.wake_at = True, [], NEVER
 

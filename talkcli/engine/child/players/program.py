@@ -114,10 +114,10 @@ class PlayerProcess:
             self.exit = io.FileIO(os.pidfd_open(self.pid))
 
     def poll(self) -> int | None:
-        """Reap the program if it has exited, and kill what it left. Return its exit status, or None if it is running.
+        """Return the exit status, or None while the program runs. After its exit, kill all processes that it started.
 
-        If a signal killed the program, the status is the negative number of the signal. The program counts as running
-        until all processes that it has started have exited.
+        This also reaps the program. If a signal killed it, the status is the negative number of the signal. The program
+        counts as running until all processes that it has started have exited.
         """
         if self._status is None:
             if hasattr(os, "waitid"):  # missing on macOS before Python 3.13
@@ -151,7 +151,7 @@ class PlayerProcess:
             wait.poll(seconds * 1000)
 
     def release(self) -> None:
-        """Close all descriptors of a program that has been reaped. May be called again."""
+        """Close all descriptors of a program that has been reaped. Calling this again does nothing."""
         for each in filter(None, (self.stdin, self.stderr, self._leash, self.exit)):
             each.close()
 
@@ -205,7 +205,7 @@ class ErrorOutput:
             self._examine_line(line)
 
     def find_error(self) -> str | None:
-        """Return the first line that looks like an error, or else the first line, or None if there are no lines."""
+        """Return the first line that looks like an error, or else the first line. Return None if there are no lines."""
         self._examine_line(self._lines.take_rest())
         return self._error or self._first
 
@@ -253,7 +253,7 @@ class ProgramPlayer(Player):
         self._write(memoryview(command.preamble))
 
     def offer(self, data: memoryview) -> int:
-        """Write the samples to the program once it has read the previous ones. Return the number of bytes written."""
+        """If the program has read all earlier samples, write these. Return the number of bytes written."""
         self.ended()  # raises CannotSpeak if the program has exited
         stdin = self._process.stdin
         if stdin.closed:

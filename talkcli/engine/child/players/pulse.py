@@ -378,7 +378,7 @@ class PulsePlayer(Player):
         self._dry_at = self._written
 
     def _on_time(self, *_: Any) -> None:
-        """Store the playback time that the server has reported, or request it again if nothing was heard."""
+        """Store the playback time that the server has reported, or request it again if nothing has been heard yet."""
         if not self.proven:
             return  # before the stream has started, the reported time is only the delay of the answer
         heard, now = c_uint64(), time.monotonic()

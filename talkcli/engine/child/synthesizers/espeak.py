@@ -177,7 +177,11 @@ class Espeak:
         return (*_list_voices(self._espeak, None), *_list_mbrola_voices(self._espeak), *_list_variants(self._espeak))
 
     def load(self, voice: str) -> None:
-        """Load a voice by its id, which may end with a variant, or by another name known to the library."""
+        """Load a voice by its id, which may end with a variant, or by another name known to the library.
+
+        Raises:
+            UnknownVoice: One of the voice's files is missing. The library keeps the previous voice.
+        """
         self._stop_phonemizer()
         # Forget the rate, so that it is set again. Otherwise some voices would make the next one up to a third slower.
         self._parameters.clear()
@@ -339,7 +343,7 @@ class EspeakPhonemizer:
 
     @contextlib.contextmanager
     def _library_call(self) -> Iterator[None]:
-        """Hold the lock in a `with` block that calls the library. After `end`, raise Stopped.
+        """Hold the library's lock during a `with` block. Raise Stopped if `end` was called.
 
         Raises:
             Stopped: `end` was called before or during the block. The result of the call may be incomplete.

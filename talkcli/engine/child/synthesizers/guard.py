@@ -187,7 +187,7 @@ def _without_leading_hyphens(text: str) -> str:
 
 
 def _split_word(match: re.Match[str]) -> str:
-    """Return the matched text. If it is a word that is too long for the library, split it first.
+    """Return the matched text. A word that is too long for the library is split.
 
     Apostrophes become blanks, or pairs of letters get another case.
     """

@@ -90,7 +90,7 @@ class ModelCache:
         """Return the paths of the encoder and the decoder, and mark them as used.
 
         Raises:
-            OSError: They aren't cached.
+            OSError: One of them isn't cached.
         """
         paths = self._cached_path(key, _ENCODER_SUFFIX), self._cached_path(key, _DECODER_SUFFIX)
         for each in paths:
@@ -231,7 +231,7 @@ class Model:
         return Frames(tuple(values), tuple(int(each) for each in np.cumsum(durations)))
 
     def decode(self, frames: Frames, begin: int, end: int, run: ModelRun) -> Any:
-        """Decode the frames from `begin` up to but not including `end`. The samples are floats from -1.0 to 1.0.
+        """Decode the frames from `begin` to `end - 1`, and return their samples as floats from -1.0 to 1.0.
 
         Raises:
             VoiceFileError: The model is faulty, or the run was ended.

@@ -96,7 +96,7 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
         return item
 
     def close(self) -> None:
-        """Tell the thread to discard its current item and end. Return without waiting for it. Call this only once."""
+        """Tell the thread to discard its current item and end, without waiting for it. Call this only once."""
         with self._lock:
             self._closed = True
             os.close(self.descriptor)
@@ -142,13 +142,16 @@ class ModelLoader:
         return self._started_at + LOAD_LIMIT_S
 
     def drop(self, voice: str) -> None:
-        """Unload a voice, and forget its error. If it is being spoken, its memory is freed after the sentence."""
+        """Unload a voice, and forget its error. If the voice is speaking, its memory is freed after the sentence."""
         if self._models.pop(voice, None):
             self._unmeasured = ""
         self.errors.pop(voice, None)
 
     def start(self, voice: str) -> None:
-        """Load a voice in the background, or report at once that it is loaded. Forget the voice's earlier error."""
+        """Load a voice in the background. If it is already loaded, add a `VoiceLoaded` event at once.
+
+        When the load begins, any earlier error of the voice is forgotten.
+        """
         if voice in self._models:
             self._events.append(VoiceLoaded(voice, 0.0))
         elif voice not in self._waiting and not (self._load and voice == self._voice):
@@ -157,7 +160,7 @@ class ModelLoader:
             self._start_next_load()
 
     def get_model(self, voice: str) -> Model | None:
-        """Return the model of a voice if it is loaded. Unload it first if it has failed and its files have changed.
+        """Return the model of a voice, or None if it isn't loaded. Unload a failed voice whose files have changed.
 
         If the thread of a load is done, finish the load first.
         """

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 else:
     Protocol = object
 
-#: The maximum number of phonemes that a model speaks at once. The time and memory that it needs grow with the square of
+#: The maximum number of phonemes in one run of a model. The time and memory that it needs grow with the square of
 #: this number. On a PC, 250 phonemes take 0.25 s and 60 MB, and 800 phonemes take 2 s and 450 MB.
 MAX_PART_PHONEMES = 250
 #: The maximum number of phonemes in a part, not counting the punctuation mark at its end.
@@ -67,7 +67,7 @@ class Phonemizer(Protocol):
 
 @frozen
 class SpeechPart:
-    """The phonemes of a sentence or of a part of a long sentence, which a model speaks at once."""
+    """The phonemes of a sentence, or of a part of a long sentence, for one run of a model."""
 
     #: IPA characters, blanks and punctuation marks; never empty
     phonemes: tuple[str, ...]
@@ -78,7 +78,7 @@ class SpeechPart:
 
 
 def split_text(phonemizer: Phonemizer, text: str) -> Iterator[SpeechPart]:
-    """Split a text into parts that a model can speak at once.
+    """Yield the parts of a text, each short enough for one run of a model.
 
     A text without any speech has no parts. The phonemizer is used only while a part is being requested.
     """
@@ -165,7 +165,7 @@ def _drop_repeated_positions(positions: Sequence[tuple[int, int]]) -> list[tuple
 
 
 def _map_indexes(first: str, second: str, places: Sequence[int]) -> list[int]:
-    """Return the indexes in the second string that correspond to `places` in the first string, which is similar."""
+    """Convert indexes in one string to the corresponding indexes in a similar string."""
     if len(first) * len(second) > _MAX_COMPARISONS:
         return [place * len(second) // len(first) for place in places]
     import difflib
