@@ -113,7 +113,7 @@ def undescribed_voices(environment: Mapping[str, str] | None = None) -> tuple[Vo
 
 
 def read_description(path: str) -> VoiceDescription:
-    """Read the description of a voice from the JSON file beside its model.
+    """Read and return the description of a voice from the JSON file beside its model.
 
     Raises:
         VoiceFileError: The file is missing, unsafe or invalid.

@@ -275,7 +275,10 @@ def _split_variants(voices: Sequence[Voice]) -> tuple[list[Voice], list[Voice]]:
 
 
 def _find_by_name(wanted: str, voices: Sequence[Voice]) -> Voice | None:
-    """Find a voice by name, ignoring case. If several match, prefer the one with the same spelling."""
+    """Find a voice by name, ignoring case. Return None if there is none.
+
+    If several voices match, prefer the one with the same spelling.
+    """
     word = _fold(wanted)
     found = [
         (called != wanted, place, voice)
@@ -297,7 +300,7 @@ def _names_of(voice: Voice) -> tuple[str, str, str, str]:
 
 
 def _find_variant(suffix: str, variants: list[Voice]) -> Voice | None:
-    """Find a variant by the part of a voice's name after the "+".
+    """Find a variant by the part of a voice's name after the "+". Return None if there is none.
 
     As in libespeak-ng, the numbers 1 to 9 select male variants, and the numbers from 11 on select female variants.
     """

@@ -123,7 +123,7 @@ def render(
 
 
 def split_into_pieces(text: str) -> Iterator[str]:
-    """Cut a text into pieces of at most `MAX_PIECE_CHARS`, at the end of a sentence or a word if possible."""
+    """Yield a text in pieces of at most `MAX_PIECE_CHARS`, cut at the end of a sentence or a word if possible."""
     start = 0
     while len(text) - start > MAX_PIECE_CHARS:
         limit = start + MAX_PIECE_CHARS
@@ -223,7 +223,7 @@ def _open_output(path: str, deadline: float, interrupt: Mapping[int, int] | None
 
 
 def _open_pipe_or_device(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> int:
-    """Open a device or a named pipe for writing. Wait until a named pipe has a reader."""
+    """Open a device or a named pipe, and return its descriptor. Wait until a named pipe has a reader."""
     while True:
         try:
             return os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)

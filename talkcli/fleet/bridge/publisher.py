@@ -99,7 +99,11 @@ class Publisher:
             self._retry_s = min(_LAST_SERVER_RETRY_S, self._retry_s * 2)
 
     async def _watch_server(self, server: LocalConnection) -> None:
-        """Watch the server, and process its lines until the connection ends."""
+        """Watch the server, and process its lines until the connection ends.
+
+        Raises:
+            ServerUnavailable: The server refused to be watched.
+        """
 
         def remember(_: JsonObject, ended: list[JsonObject]) -> None:
             for goal in goals(ended, "goal"):

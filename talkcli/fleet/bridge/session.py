@@ -288,7 +288,7 @@ class RemoteSession:
         self._end_if_done()
 
     def end(self, why: str | None = None) -> None:
-        """End the session. The server cancels unfinished requests, if possible.
+        """End the session, and drop its queued requests. The server cancels unfinished requests, if possible.
 
         Args:
             why: a message for the client, which is sent only if the client is waiting for something.

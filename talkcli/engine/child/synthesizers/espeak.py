@@ -389,7 +389,7 @@ def _list_variants(espeak: Any) -> list[Voice]:
 
 
 def _list_mbrola_voices(espeak: Any) -> list[Voice]:
-    """Return the installed MBROLA voices. The library also lists those that aren't installed."""
+    """Return those of the MBROLA voices listed by the library that are installed."""
     if not on_path("mbrola"):
         return []
     return [each for each in _list_voices(espeak, _MBROLA) if _has_mbrola_data(each.id)]

@@ -108,7 +108,7 @@ def _unsafe_characters(language: str) -> re.Pattern[str]:
 
 
 def _split_number(number: str, least: int, most: int) -> str:
-    """If a number has `least` to `most` digits, split it in two by replacing one digit with a superscript."""
+    """Return a number, split in two with a superscript digit if it has `least` to `most` digits."""
     if not least <= sum(map(str.isdigit, number)) <= most:
         return number
     middle = next(place for place in range(len(number) // 2, len(number)) if number[place].isdigit())
@@ -116,7 +116,7 @@ def _split_number(number: str, least: int, most: int) -> str:
 
 
 def _without_long_initials(text: str) -> str:
-    """Replace dots with blanks in long sequences of initials, which would overrun the library's buffers."""
+    """Return a text with blanks for dots in long sequences of initials, which would overrun the library's buffers."""
     result = list(text)
     looked_up = spelled = words = size = 0
     dots: list[int] = []
@@ -171,7 +171,7 @@ def _max_bytes(character: str) -> int:
 
 
 def _without_leading_hyphens(text: str) -> str:
-    """Replace a hyphen with a blank if only symbols come before it in its clause, as in "'-o".
+    """Return a text with blanks for hyphens that follow only symbols in their clause, as in "'-o".
 
     The library doesn't mark the beginning of the word after such a hyphen. Later, it looks for the mark and reads
     beyond the start of its list of phonemes. This crashes Vietnamese, Danish, Hindi and other voices.

@@ -108,6 +108,9 @@ class Piper:
         """Choose a voice by its id, which may end with "#" and a speaker.
 
         If a file of the voice is faulty, `speak` reports the error later.
+
+        Raises:
+            UnknownVoice: A package, the voice or the speaker is missing.
         """
         if missing := models.missing_package():
             raise UnknownVoice(missing)
@@ -151,7 +154,11 @@ class Piper:
             raise CannotSpeak(Reason.VOICE_FAILED, words) from error
 
     def _wait_for_model(self, voice: str, sink: SampleSink) -> Model:
-        """Return the model of a voice, after loading it if necessary. The sink keeps playing meanwhile."""
+        """Return the model of a voice, after loading it if necessary. The sink keeps playing meanwhile.
+
+        Raises:
+            CannotSpeak: The voice can't be loaded.
+        """
         loader = self.loader
         if loader.get_model(voice) is None:
             loader.start(voice)  # Try again even after an error, because the files may have been repaired.

@@ -103,7 +103,7 @@ class _Reader:
         self._fields_left = _MAX_FIELDS
 
     def fields(self, raw: Buffer) -> list[Field]:
-        """Parse a protobuf message, and return its fields."""
+        """Parse a protobuf message, and return its fields. Raise NotSplit if it is invalid."""
         found = []
         at, end = 0, len(raw)
         while at < end:
@@ -242,7 +242,7 @@ def _names(fields: Iterable[Field], field_number: int) -> list[str]:
 
 
 def _parse_integer(raw: Buffer, at: int) -> tuple[int, int]:
-    """Decode the integer at an index. Return it with the index of the byte after it."""
+    """Decode the integer at an index, and return it with the index of the next byte."""
     result = shift = 0
     while at < len(raw) and shift < 64:  # Longer integers aren't valid.
         byte = raw[at]
