@@ -200,7 +200,6 @@ class Talk(Clients):
 
     @property
     def log(self) -> str:
-        """The server's log so far."""
         with open(f"{self.directory}/log", encoding="utf-8", errors="replace") as file:
             return file.read()
 
@@ -254,7 +253,6 @@ class Talk(Clients):
             file.write(behaviour)
 
     def connect(self) -> Wire:
-        """Return a raw connection."""
         return Wire(self.socket)
 
     def request(self, request: str, /, timeout: float = PATIENCE, **fields: object) -> Message:
@@ -263,7 +261,6 @@ class Talk(Clients):
             return wire.request(request, timeout=timeout, **fields)
 
     def goal(self, goal_id: str) -> Message:
-        """Return the current state of a goal."""
         reply = self.request("status", id=goal_id)
         assert reply["ok"], reply
         goal: Message = reply["goal"]

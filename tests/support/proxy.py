@@ -69,7 +69,6 @@ class Proxy(contextlib.AbstractContextManager["Proxy"]):
         return holding
 
     def release(self) -> None:
-        """Forward all data again."""
         for passing in self._passing.values():
             self._do(passing.set)
 

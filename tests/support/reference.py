@@ -67,7 +67,7 @@ def render(
     The settings apply to sentences that are plain strings.
     """
     plain = Sentence("", rate, volume, voice, pitch)
-    complete = [replace(plain, text=each) if isinstance(each, str) else each for each in sentences]
+    complete = [replace(plain, text=item) if isinstance(item, str) else item for item in sentences]
     return [rendering.samples for rendering in render_with_words(complete, timeout=timeout)]
 
 
@@ -78,7 +78,7 @@ def without_leading_zeros(samples: Samples) -> Samples:
 
 def render_with_words(sentences: Sequence[str | Sentence], *, timeout: float = 30) -> list[Rendering]:
     """Return the rendering of each sentence, as `render` does, with its words."""
-    return list(_rendered(tuple(Sentence(each) if isinstance(each, str) else each for each in sentences), timeout))
+    return list(_rendered(tuple(Sentence(item) if isinstance(item, str) else item for item in sentences), timeout))
 
 
 @functools.cache

@@ -44,14 +44,14 @@ class Screen:
 
     def draw(self, text: str) -> None:
         """Draw a text that may contain complete control sequences."""
-        place = 0
-        while place < len(text):
-            if control := _CONTROL.match(text, place):
+        index = 0
+        while index < len(text):
+            if control := _CONTROL.match(text, index):
                 self._control(control["letter"], control["numbers"])
-                place = control.end()
+                index = control.end()
             else:
-                self._character(text[place])
-                place += 1
+                self._character(text[index])
+                index += 1
 
     @property
     def lines(self) -> list[str]:
@@ -73,9 +73,9 @@ class Screen:
         elif character == "\n":
             self._next_row()
         elif unicodedata.category(character) in {"Mn", "Me"}:
-            place = max((cell for cell in range(min(self.column, len(row))) if row[cell][0]), default=None)
-            if place is not None:
-                row[place] = (row[place][0] + character, row[place][1])
+            index = max((cell for cell in range(min(self.column, len(row))) if row[cell][0]), default=None)
+            if index is not None:
+                row[index] = (row[index][0] + character, row[index][1])
         else:
             assert character.isprintable(), f"{character!r} reached the terminal"
             width = 2 if unicodedata.east_asian_width(character) in "WF" else 1

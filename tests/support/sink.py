@@ -130,7 +130,6 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
 
     @property
     def pid(self) -> int:
-        """The process id of the sound server."""
         return self._running().pid
 
     @contextlib.contextmanager
@@ -148,7 +147,6 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
                 self._taps.remove(recording)
 
     def play(self, samples: npt.NDArray[np.int16]) -> None:
-        """Play samples, and wait for the end."""
         command = ["aplay", "-q", "-t", "raw", "-f", "S16_LE", "-r", str(RATE), "-c", "1", "-"]
         subprocess.run(command, env=self._child_env(), input=samples.tobytes(), check=True, timeout=60)
 
@@ -157,7 +155,6 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
         self.pactl("suspend-sink", _NAME, "1")
 
     def resume(self) -> None:
-        """Resume a suspended sink."""
         self.pactl("suspend-sink", _NAME, "0")
 
     def unload(self) -> None:
@@ -195,7 +192,6 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
         self.reload(warm=warm)
 
     def pactl(self, *arguments: str) -> str:
-        """Run pactl and return its output."""
         return pactl(self._child_env(), *arguments)
 
     def _running(self) -> subprocess.Popen[bytes]:

@@ -55,8 +55,6 @@ class Sent:
 
 
 class Ledger:
-    """All goals that the desks have sent."""
-
     def __init__(self) -> None:
         self._numbers = itertools.count(1)
         self._lock = threading.Lock()
@@ -76,7 +74,6 @@ class Ledger:
 
 
 def connect(broker: Broker, robot: str, user: str) -> Connection:
-    """Connect to a robot as this user."""
     return connect_robot(robot, from_environment(broker.env(user, password=False)), name="soak")
 
 

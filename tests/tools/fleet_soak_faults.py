@@ -92,8 +92,6 @@ class ReplyRecorder:
 
 
 class FleetFaults(FaultInjector):
-    """The faults of a robot with a broker."""
-
     def __init__(
         self, rng: random.Random, talk: Talk, broker: Broker, bridge: Bridge, proxy: Proxy, replies: ReplyRecorder
     ) -> None:

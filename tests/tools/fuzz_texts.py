@@ -101,14 +101,11 @@ _SHORT_CHARS, _MEDIUM_CHARS, _LONG_CHARS = 24, 220, 1500
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A text, and the voice that speaks it."""
-
     voice: str
     text: str
 
 
 def daily_seed() -> int:
-    """Return a seed that changes every day."""
     return dt.datetime.now(dt.timezone.utc).date().toordinal()
 
 
@@ -124,7 +121,6 @@ def cases(seed: int, voices: Sequence[str]) -> Iterator[Case]:
 
 
 def random_text(source: random.Random) -> str:
-    """Return a mutated text."""
     limit = source.choices((_SHORT_CHARS, _MEDIUM_CHARS, _LONG_CHARS), (78, 20, 2))[0]
     text = source.choice(_ORIGINS)(source)[:limit]
     for _ in range(source.choice((0, 1, 1, 2, 3, 5, 8))):
@@ -270,8 +266,6 @@ _MUTATIONS: tuple[Callable[[random.Random, str], str], ...] = (
 
 @dataclass(slots=True)
 class Tally:
-    """The results of a run."""
-
     texts: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
     deaths: list[str] = field(default_factory=list)  # crashes, with the voice and the text

@@ -124,7 +124,6 @@ class Server:
 
 
 async def run(names: list[str], broker_url: str, directory: str, spoken: TextIO) -> None:
-    """Run robots until SIGTERM."""
     loop = asyncio.get_running_loop()
     loop.set_exception_handler(log.handle_loop_error)
     descriptors = raise_descriptor_limit(_DESCRIPTORS * len(names))

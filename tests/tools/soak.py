@@ -38,8 +38,6 @@ _LOG_LINES_PER_FAULT = 6
 
 @dataclass(slots=True)
 class Report:
-    """The results of a soak test."""
-
     ends: Counter[tuple[str, str | None]]  # by state and reason
     faults: Counter[str]
     heard_whole: int = 0  # sentences

@@ -112,7 +112,6 @@ class Narrator:
         self.ends: Counter[str] = Counter()
 
     def run(self, over: threading.Event) -> None:
-        """Speak sentences until `over` is set."""
         while not over.wait(0.2):
             self._narrate(_SENTENCES[self.ends.total() % len(_SENTENCES)])
 

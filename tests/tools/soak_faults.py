@@ -58,8 +58,6 @@ class FaultInjector:
 
 
 class RobotFaults(FaultInjector):
-    """The faults of a single robot."""
-
     def __init__(self, talk: Talk, sink: Sink, player: str, rng: random.Random) -> None:
         super().__init__(rng)
         self._talk = talk

@@ -122,14 +122,12 @@ def measure_roster(fleet: MeasuredFleet) -> None:
 
 
 def measure_idle(fleet: MeasuredFleet) -> None:
-    """Measure the traffic of robots that do nothing."""
     traffic = fleet.traffic(lambda: time.sleep(fleet.idle_s))
     for name in _COUNTS:
         _print(f"idle: {name} per robot", [traffic[name] / traffic["seconds"] / len(fleet.names)], "/s")
 
 
 def measure_sentence(fleet: MeasuredFleet) -> None:
-    """Measure the traffic of a sentence."""
     traffic = fleet.traffic(lambda: fleet.say(1))
     for name in list(_COUNTS)[:2]:
         _print(f"a sentence: {name} per robot", [traffic[name]], "")

@@ -58,7 +58,6 @@ def measure(name: str, harness: Harness) -> list[Row]:
 
 
 def main() -> None:
-    """Measure the groups that the command line names."""
     parser = argparse.ArgumentParser("python -m tests.tools.bench", description=_ABOUT)
     names = f"{', '.join(GROUPS)}; {', '.join(NAMED)} (the last three only if they are named)"
     parser.add_argument("rows", nargs="*", metavar="ROW", help=names)

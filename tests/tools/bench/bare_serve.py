@@ -41,7 +41,6 @@ class Server:
             threading.Thread(target=self._read, args=(self._engine,), daemon=True).start()
 
     def submit(self, client: Client, seq: int) -> None:
-        """Accept a goal."""
         self._count += 1
         goal_id = f"bare-{self._count}"
         client.send({"seq": seq, "ok": True, "goal": _goal(goal_id, State.PENDING)}, _event(goal_id, State.PENDING))
@@ -105,7 +104,6 @@ def _event(goal_id: str, state: State) -> dict[str, object]:
 
 
 async def main() -> None:
-    """Serve until SIGTERM."""
     loop, path = asyncio.get_running_loop(), os.environ["TALK_SOCKET"]
     server, ended = Server(loop), asyncio.Event()
     loop.add_signal_handler(signal.SIGTERM, ended.set)

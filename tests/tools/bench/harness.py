@@ -68,7 +68,6 @@ class Harness(contextlib.ExitStack):
 
     @cached_property
     def sink(self) -> Sink:
-        """A sound server with a recorded null sink."""
         sink = self.enter_context(Sink())
         self.enter_context(fine_blocks(sink))
         return sink
@@ -80,7 +79,6 @@ class Harness(contextlib.ExitStack):
 
     @cached_property
     def client(self) -> Client:
-        """A connection to this server."""
         return self.enter_context(Client(self.talk.socket, name="bench"))
 
     @cached_property
@@ -115,7 +113,6 @@ class Harness(contextlib.ExitStack):
         )
 
     def command(self, *arguments: str) -> Action:
-        """Return the action that starts a command."""
         return lambda: partial(finish, self.start(arguments))
 
     def until_end(self, command: Sequence[str], env: Mapping[str, str] | None = None) -> float:

@@ -23,7 +23,7 @@ _PROGRAMS = {
     "mosquitto": "-h",
 }
 _PACKAGES = ("talkcli", "click", "pyttsx3", "paho-mqtt")
-#: A server is idle after this time without context switches. Time limit for this.
+#: Time without context switches after which a server is idle, and time limit for this.
 _IDLE_S, _IDLE_LIMIT_S = 1.0, 15.0
 
 
@@ -52,7 +52,6 @@ class ProcessorUse:
     processor: float
 
     def since(self, before: ProcessorUse) -> ProcessorUse:
-        """Return the difference from an earlier value."""
         return ProcessorUse(self.switches - before.switches, self.processor - before.processor)
 
 

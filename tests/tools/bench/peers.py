@@ -45,7 +45,6 @@ EspeakMbrola 0
 
 
 def installed() -> bool:
-    """Return whether all peers are installed."""
     return all(map(shutil.which, PROGRAMS))
 
 

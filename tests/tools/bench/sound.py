@@ -124,7 +124,6 @@ def at_once(harness: Harness) -> list[Row]:
 
 
 def cancel(harness: Harness) -> list[Row]:
-    """Measure the commands that stop a sentence."""
     say, spd = partial(_say, harness.client), "spd-say"
     subjects = {"talk": partial(harness.until_silence, say, harness.command(TALK, "cancel"))}
     if harness.has_peers:
@@ -154,7 +153,6 @@ def connection(harness: Harness) -> list[Row]:
 
 
 def pause(harness: Harness) -> list[Row]:
-    """Measure a pause on an open connection."""
 
     def start_pause() -> Callable[[], object]:
         harness.client.pause()

@@ -23,7 +23,6 @@ class Limit:
     at_least: bool = False
 
     def holds(self, value: float) -> bool:
-        """Return whether a value is within the limit."""
         return value >= self.bound if self.at_least else value <= self.bound
 
     def text(self, unit: str) -> str:
@@ -62,7 +61,6 @@ class Row:
 
     @property
     def goal(self) -> str:
-        """The limits as the table shows them."""
         return ", ".join(limit.text(self.unit) for limit in self.limits)
 
     @property
