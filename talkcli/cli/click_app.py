@@ -74,7 +74,7 @@ class _OptionType(click.FloatRange):
             raise click.BadParameter(str(error), ctx, param, source) from error
 
     def _describe_range(self) -> str:
-        """Return the range of valid numbers, as click shows it in help."""
+        """Return the range of valid numbers as text for click's help."""
         return self._option.range
 
 

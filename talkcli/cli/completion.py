@@ -51,7 +51,7 @@ _BASH_SPECIAL = re.compile(r"[^\w@%+=:,./-]")
 
 
 def print_completions(talk: click.Command, options: CommonOptions) -> int:
-    """Print the completions of the line that the completion script has passed, and return the exit code."""
+    """Print completions for the line received from the shell's completion script, and return the exit code."""
     try:
         click.echo("\n".join(_completion_lines(talk, options)).encode())
     except Exception:

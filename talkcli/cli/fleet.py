@@ -94,7 +94,7 @@ def _show_event(
         show_result(options, [_snapshot_object(event.robot)], lambda: lines)
     elif not options.quiet:
         if isinstance(event, BrokerAway):
-            note(f"{event.why}; trying again for {event.limit:g} s")
+            note(f"{event.why}; reconnecting for up to {event.limit:g} s")
         else:
             note(f"the broker at {broker.url} is back after {event.after:.1f} s")
 

@@ -97,7 +97,7 @@ def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, 
     name, equals, text = word.partition("=")
     option, value = flags[name]
     if option.kind is OUTPUT_FILE or (equals and (option.kind is FLAG or name[:2] != "--")):
-        raise ValueError(f"{word} isn't a plain option")
+        raise ValueError(f"click has to parse {word}")
     given[option.name] = value if option.kind is FLAG else read_value(option, text if equals else next(rest))
 
 

@@ -54,7 +54,7 @@ _NO_LIMIT = float("inf")
 
 
 class InputTooLong(UsageError):
-    """Raised if standard input exceeds the maximum length of a text."""
+    """Raised if standard input is longer than a text may be."""
 
 
 def read_text(end: float | None, *, stop_without_reader: bool = False, any_length: bool = False) -> str | int:

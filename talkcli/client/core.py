@@ -260,7 +260,7 @@ def read_greeting(line: bytes, path: str) -> tuple[str, int | None]:
     except BadRequest:
         greeting = {}
     if "talk" not in greeting:
-        raise ServerUnavailable(f"the program that listens at {path} is not a talk server")
+        raise ServerUnavailable(f"the program listening at {path} is not a talk server")
     events.check_greeting(greeting)
     if "error" in greeting:
         from talkcli.terminal.text import printable  # rarely needed, and slow to import
@@ -386,7 +386,7 @@ class ClientCore:
         self._unsent.append((line, exchange))
         early, self._sent_early = self._sent_early, b""
         if not line.startswith(early):
-            raise AssertionError(f"the request {line!r} was sent early as {early!r}")
+            raise AssertionError(f"the early request {early!r} differs from the request {line!r}")
         if early:
             self.mark_sent(len(early))
 

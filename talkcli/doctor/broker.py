@@ -254,7 +254,7 @@ class BrokerExamination:
 
 
 def _read_expiry(connection: socket.socket, context: ssl.SSLContext, host: str) -> float:
-    """Start TLS on a connection, and return when the broker's certificate expires, in seconds since 1970."""
+    """Start TLS on a connection, and return the expiry time of the broker's certificate in seconds since 1970."""
     with context.wrap_socket(connection, server_hostname=host) as secured:
         return ssl.cert_time_to_seconds(str((secured.getpeercert() or {})["notAfter"]))
 

@@ -109,7 +109,7 @@ class LocalExamination:
 
     @property
     def _player(self) -> str | None:
-        """The configured player, or None for the automatic choice."""
+        """The player that the server reports or the environment names, or None if the engine chooses one."""
         return self._setting("player", "TALK_PLAYER")
 
     def _check_neural(self) -> Iterator[Finding]:

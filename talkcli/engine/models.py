@@ -52,7 +52,7 @@ PAD_SYMBOL, BEGIN_SYMBOL, END_SYMBOL = "_", "^", "$"
 
 
 class VoiceFileError(Exception):
-    """Raised if a file of a voice is missing, unsafe or invalid. The message names the file and says what to do."""
+    """Raised if a neural voice can't be used, usually because one of its files is missing, unsafe or invalid."""
 
 
 @frozen

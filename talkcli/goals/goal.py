@@ -179,7 +179,7 @@ def read_fields(cls: type, message: object) -> dict[str, Any]:
 
 
 def message_details(message: str | None) -> str:
-    """Return a goal's message without a beginning that only repeats the state, such as "speech failed: "."""
+    """Return a goal's message, but without a prefix such as "speech failed: ", which only repeats the state."""
     head, _, details = (message or "").partition(": ")
     return details if head in _STATE_WORDS else message or ""
 

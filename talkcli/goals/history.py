@@ -86,7 +86,7 @@ class SpeechTimes:
         self._starts: OrderedDict[str | bytes, tuple[float, str]] = OrderedDict()
 
     def add(self, record: Record) -> None:
-        """Record the start time of a goal that was at least partly heard, by its key and by its text."""
+        """Record when a goal started, under its key and its text. The goal must have been heard, at least in part."""
         for each in (record.say.key, _digest(record.say.text)):
             if each is not None:
                 _set_newest(self._starts, each, (record.began_at, record.id), MAX_SPEECH_TIMES)

@@ -33,7 +33,7 @@ MAX_ENGINE_DEATHS = 2
 
 
 class VoiceState(Enum):
-    """The state of a neural voice."""
+    """How far the engine has got with loading a neural voice."""
 
     WAITING = "waiting"  # not yet loaded
     LOADING = "loading"

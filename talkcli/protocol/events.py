@@ -193,7 +193,7 @@ def from_json(message: JsonObject) -> Event | None:
 
 
 def _event_json(kind: str, event: StateChanged | WordHeard | PausedChanged) -> JsonObject:
-    """Return an event's JSON object, without its goal."""
+    """Return an event's fields for its JSON object, without its goal. The caller converts enums and objects."""
     own = {name: value for name, value in fields(event).items() if name not in {"at", "n", "goal"}}
     return {"event": kind, **own, "n": event.n, "at": event.at}
 

@@ -133,7 +133,7 @@ class Speech:
         return self.voices.listed is None and self.engine_status in {"starting", READY}
 
     def waiting_for_silence(self, record: Record) -> WaitingList:
-        """Return the waiting list for requests that continue when this goal falls silent, resumes or ends."""
+        """Return the list of requests that wait until this goal is silent, resumes or ends."""
         return self._waiting_for_silence.setdefault(record, {})
 
     # -- the scheduler's effects

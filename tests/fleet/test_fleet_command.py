@@ -229,7 +229,7 @@ def test_watch_reports_a_lost_broker_and_then_the_changes(broker: Broker, desk: 
     done = watching.end()
     assert done.code == 130
     gone, back = done.err.splitlines()
-    assert gone == f"talk: the connection to the broker at {broker.url} was lost; trying again for 30 s"
+    assert gone == f"talk: the connection to the broker at {broker.url} was lost; reconnecting for up to 30 s"
     assert back.startswith(f"talk: the broker at {broker.url} is back after ")
 
 

@@ -284,7 +284,7 @@ def test_a_goal_can_be_cancelled_until_all_outcomes_are_returned(fleet: Fleet, p
         else:
             assert (outcome.robot, outcome.state) == ("wh-2", "RECALLED")
     assert states(pair, goal) == ["SUCCEEDED", "RECALLED"]
-    with pytest.raises(UsageError, match="all outcomes have already been returned; cancel the goal by its id"):
+    with pytest.raises(UsageError, match="this request has ended; to cancel its goal, use the goal's id"):
         outcomes.cancel()
 
 

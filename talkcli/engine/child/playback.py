@@ -631,7 +631,7 @@ class Playback:
     # -- waiting
 
     def _wait_for_continue(self) -> None:
-        """Confirm the pause, and wait without a player until the sentence continues."""
+        """Confirm the pause, and wait until the sentence continues. There is no player meanwhile."""
         while self._runner.hold_number:
             self._runner.confirm_hold()
             self._wait()

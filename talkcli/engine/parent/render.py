@@ -174,7 +174,7 @@ def _convert_engine_error(error: EngineFailed, voice: str | None) -> RenderFaile
 
 
 def _convert_goal_error(ended: protocol.Ended, engine_path: str, path: str) -> RenderFailed:
-    """Convert the unsuccessful end of a goal to an exception that names the user's file."""
+    """Return an exception for a goal that failed or was stopped. Its message names the user's file."""
     reason = ended.reason or Reason.ENGINE_FAILED
     message = (ended.message or "the engine stopped before the end of the text").replace(engine_path, path)
     if reason in _FILE_REASONS:

@@ -466,7 +466,7 @@ class Bridge:
             self._publish_presence()
 
     async def _go_offline(self) -> None:
-        """Disconnect from the broker. Publish that the robot is offline, unless another bridge has its name."""
+        """Disconnect from the broker. Report the robot as offline first, unless another bridge uses its name."""
         link = self._link
         if link is None:
             return

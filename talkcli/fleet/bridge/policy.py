@@ -184,7 +184,7 @@ def _parse_request_fields(kind: str, payload: bytes) -> JsonObject:
         return {"request": "cancel"}
     line = payload.removesuffix(b"\n") if kind == topics.REQUEST else payload
     if len(line) >= MAX_LINE_BYTES:
-        raise LineTooLong(f"a request must have at most {MAX_LINE_BYTES} bytes")
+        raise LineTooLong(f"the request is longer than {MAX_LINE_BYTES:,} bytes")
     if kind == topics.REQUEST:
         return decode(line)
     try:

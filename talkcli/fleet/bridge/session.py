@@ -395,7 +395,7 @@ class RemoteSession:
         """Send a request to the server. If it is too long, refuse it and return False."""
         assert self._server
         if not self._server.send(exchange):
-            self.refuse(exchange.remote, "line_too_long", f"a request must have at most {MAX_LINE_BYTES} bytes")
+            self.refuse(exchange.remote, "line_too_long", f"the request is longer than {MAX_LINE_BYTES:,} bytes")
             return False
         return True
 

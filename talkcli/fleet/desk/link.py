@@ -276,7 +276,7 @@ class DeskLink:
         return TICK_EVERY_S if self._opening else max(0.0, self._next_attempt_at - now)
 
     def _end_attempt(self, opening: LinkOpener) -> None:
-        """Start using the connection that was opened. If opening it has failed, schedule the next attempt."""
+        """Start using a newly opened connection. If it could not be opened, schedule the next attempt."""
         self._opening = None
         if opening.error is not None:
             self._failed_attempts += 1

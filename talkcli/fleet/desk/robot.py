@@ -229,7 +229,7 @@ class RobotConnection(Connection):
             self.absent_since = time.monotonic()
 
     def _update_presence(self, payload: bytes) -> None:
-        """Record from a presence message whether the robot is absent. After an absence, send open requests again.
+        """Read from a presence message whether the robot is absent. When it is back, send open requests again.
 
         It comes from the robot's bridge, or from the broker if the bridge has lost its connection.
         """

@@ -192,7 +192,7 @@ class FleetRequest:
         if not isinstance(self.request, Say):
             return
         if self._closed:
-            raise UsageError("all outcomes have already been returned; cancel the goal by its id")
+            raise UsageError("this request has ended; to cancel its goal, use the goal's id")
         goal_id = self._canceled_id = str(self.request.id)
         group = self._selection.group
         if group is not None:

@@ -152,7 +152,7 @@ def _read_states(messages: list[Message]) -> list[RobotInfo]:
 
 
 class FleetWatch:
-    """Watches all robots of a fleet, or some of them. Only one thread may use this object."""
+    """Watches some or all robots in a fleet. Only one thread may use this object."""
 
     def __init__(self, broker: Broker, selection: Selection | None = None) -> None:
         """Prepare to watch robots. `events` connects to the broker.

@@ -104,7 +104,7 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
         self._room.release()
 
     def _put(self, item: _T | None, error: BaseException | None = None) -> None:
-        """Add an item, or the end of the iterator with its error, and make the descriptor readable."""
+        """Add an item or a mark for the end of the iterator, and make the descriptor readable."""
         self._made.append((item, error))
         with self._lock:
             if not self._closed:
@@ -173,7 +173,7 @@ class ModelLoader:
         return model
 
     def mark_spoken(self, voice: str) -> None:
-        """Schedule a memory measurement, because the first sentences of a voice allocate memory permanently."""
+        """Schedule a memory measurement. The first sentences with a voice need memory that is never freed."""
         if voice not in self._models:
             self._unmeasured = ""  # The voice was unloaded during the sentence, and its memory has been freed just now.
         elif self._unmeasured is None:
