@@ -21,7 +21,10 @@ EXIT_SIGPIPE = EXIT_SIGNAL + 13  # used if standard output is closed
 
 
 class TalkError(Exception):
-    """Base class for all errors. `code` is machine-readable, and `message` is human-readable."""
+    """Base class for all errors.
+
+    `code` is machine-readable, and `message` is human-readable.
+    """
 
     code = "error"
     exit_code = EXIT_ERROR

@@ -34,7 +34,9 @@ def named_socket(option: str | None) -> str | None:
 
 
 def named_robot(option: str | None, socket: str | None) -> str | None:
-    """Return the robot named by --robot or by TALK_ROBOT, or None. TALK_ROBOT is ignored if --socket is given.
+    """Return the robot named by --robot or by TALK_ROBOT, or None.
+
+    TALK_ROBOT is ignored if --socket is given.
 
     Both options take precedence over the variables, and TALK_ROBOT over TALK_SOCKET.
     """
@@ -42,7 +44,10 @@ def named_robot(option: str | None, socket: str | None) -> str | None:
 
 
 def client_sockets(named: str | None) -> list[str]:
-    """Return the socket paths that a client tries, in order. If `named` is given, it is the only one."""
+    """Return the socket paths that a client tries, in order.
+
+    If `named` is given, it is the only one.
+    """
     if named:
         return [named]
     directories = [os.environ.get("XDG_RUNTIME_DIR"), *_runtime_directories(os.getuid())]
@@ -105,7 +110,9 @@ def sudo_caller_socket() -> str | None:
 
 
 def server_socket(named: str | None) -> str:
-    """Return the path for a server's socket. For the default path, also create the directory.
+    """Return the path for a server's socket.
+
+    For the default path, also create the directory.
 
     Raises:
         AddressInUse: the directory is missing or not safe.

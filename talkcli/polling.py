@@ -1,4 +1,7 @@
-"""Wait for file descriptors, with a time limit. Other descriptors can interrupt the wait."""
+"""Wait for file descriptors, with a time limit.
+
+Other descriptors can interrupt the wait.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,9 @@ class Interrupted(Exception):
 def wait_ready(
     watched: Mapping[int, int], timeout: float | None, interrupt: Mapping[int, int] | None = None
 ) -> set[int]:
-    """Wait for descriptors, and return the ready ones, if any. Raise Interrupted if one of `interrupt` is ready.
+    """Wait for descriptors, and return the ready ones, if any.
+
+    Raise Interrupted if one of `interrupt` is ready.
 
     Args:
         watched: the poll events to wait for, by descriptor. Errors and hang-ups always count.

@@ -19,7 +19,10 @@ _RELEASE_S = 0.01
 
 
 def open_pipes(count: int) -> list[tuple[int, int]]:
-    """Open pipes, and return the reading and writing end of each. If one can't be opened, none is left open."""
+    """Open pipes, and return the reading and writing end of each.
+
+    If one can't be opened, none is left open.
+    """
     with contextlib.ExitStack() as opened:
         pipes = []
         for _ in range(count):
@@ -57,7 +60,10 @@ def kill_holders(pipe: int) -> bool:
 
 
 def kill(pids: Iterable[int]) -> bool:
-    """Kill the processes, and return whether any was killed. A negative id means a process group."""
+    """Kill the processes, and return whether any was killed.
+
+    A negative id means a process group.
+    """
     killed = False
     for pid in pids:
         with contextlib.suppress(ProcessLookupError, PermissionError):

@@ -110,7 +110,10 @@ class Screen:
 
 
 def record(speed: float) -> list[Frame]:
-    """Type and run the commands in a terminal, and return all screens. At speed 0, there are no pauses."""
+    """Type and run the commands in a terminal, and return all screens.
+
+    At speed 0, there are no pauses.
+    """
     with contextlib.ExitStack() as stack:
         place = stack.enter_context(tempfile.TemporaryDirectory(prefix="robot-"))
         env = _environment(place)
@@ -246,7 +249,10 @@ def picture(frames: list[Frame]) -> str:
 
 
 def _lives(frames: list[Frame], number: int, whole: float) -> list[tuple[Row, float, float]]:
-    """Return the contents of a row, each with the times at which it appears and disappears. Omit empty contents."""
+    """Return the contents of a row, each with the times at which it appears and disappears.
+
+    Omit empty contents.
+    """
     contents: list[tuple[Row, float, float]] = []
     before: Row = ()
     since = 0.0
@@ -260,7 +266,10 @@ def _lives(frames: list[Frame], number: int, whole: float) -> list[tuple[Row, fl
 
 
 def _drawn(row: Row, top: float) -> str:
-    """Return the SVG of a row. Each run of equal attributes has its own position, whatever the width of the font."""
+    """Return the SVG of a row.
+
+    Each run of equal attributes has its own position, whatever the width of the font.
+    """
     parts, column = [], 0
     while column < len(row):
         attributes = row[column][1]

@@ -79,7 +79,10 @@ class _OptionType(click.FloatRange):
 
 
 def _make_click_option(option: Option, *, common: bool = False) -> click.Option:
-    """Create the click version of an option. The value of a common option is stored in CommonOptions."""
+    """Create the click version of an option.
+
+    The value of a common option is stored in CommonOptions.
+    """
     flag = option.kind is FLAG
     return click.Option(
         [*option.flags.split(", "), option.name],
@@ -198,7 +201,10 @@ class ClickCommand(_HelpfulCommand):
         formatter.write("\nCommon options and exit codes: talk --help\n")
 
     def _run(self, **given: Any) -> int | None:
-        """Run the command, and return its exit code. Raise a click.UsageError if its options can't be combined."""
+        """Run the command, and return its exit code.
+
+        Raise a click.UsageError if its options can't be combined.
+        """
         context = click.get_current_context()
         options: CommonOptions = context.obj
         source = context.get_parameter_source
@@ -238,7 +244,10 @@ class _CommandGroup(_HelpfulCommand, click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Return a command's name, the command and its arguments. Raise click.UsageError for an unknown command."""
+        """Return a command's name, the command and its arguments.
+
+        Raise click.UsageError for an unknown command.
+        """
         unknown = args[0] not in COMMANDS and args[0][:1] not in ("", "-")
         if unknown and not ctx.resilient_parsing:  # errors aren't shown during completion
             raise click.UsageError(_describe_unknown_command(args), ctx)
@@ -291,7 +300,10 @@ def run(arguments: list[str]) -> int:
 
 
 def _run_group(arguments: list[str], options: CommonOptions) -> object:
-    """Run a command line with click, and return its result. Report click's errors, and return their exit codes."""
+    """Run a command line with click, and return its result.
+
+    Report click's errors, and return their exit codes.
+    """
     try:
         with talk.make_context("talk", [*arguments], obj=options) as context:
             return talk.invoke(context)

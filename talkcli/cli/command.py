@@ -128,7 +128,10 @@ class Command:
         return Selection(robot).fault
 
     def run(self, options: CommonOptions, given: Mapping[str, Any]) -> int | None:
-        """Run the command on this machine, one robot or several robots. Return its exit code, or None for success."""
+        """Run the command on this machine, one robot or several robots.
+
+        Return its exit code, or None for success.
+        """
         options.urgent = self.urgent
         function = self.function or f"ask:{self.name}"
         robot = None if self._is_local(given) else named_robot(options.robot, options.socket)
@@ -260,7 +263,9 @@ def _format_byte(character: str) -> str:
 
 
 def replace_bad_bytes(text: str, first_line: int = 1) -> tuple[str, str | None]:
-    """Replace invalid bytes in a text with U+FFFD. Return the text, and a message about the replaced bytes.
+    """Replace invalid bytes in a text with U+FFFD.
+
+    Return the text, and a message about the replaced bytes.
 
     Args:
         text: the text, with invalid bytes decoded to surrogates.

@@ -132,7 +132,10 @@ def _with_flag(value: str, word: str) -> str:
 
 
 def _quote_for_bash(value: str, quote: str) -> str:
-    """Escape a value for bash. `quote` is an unclosed quotation mark before it, or an empty string."""
+    """Escape a value for bash.
+
+    `quote` is an unclosed quotation mark before it, or an empty string.
+    """
     if quote == "'":
         return value.replace("'", "'\\''")
     if quote:
@@ -196,7 +199,9 @@ def unfinished_keys(options: CommonOptions, _: str) -> Offers:
 
 
 def voices(options: CommonOptions, incomplete: str) -> Offers:
-    """Return the languages of the voices as completions. If no language matches, return voice ids or names.
+    """Return the languages of the voices as completions.
+
+    If no language matches, return voice ids or names.
 
     Neural voices are always offered by id, because there are few of them and users select them by id.
     """
@@ -240,7 +245,10 @@ def _request_status(options: CommonOptions) -> ServerStatus:
 
 
 def _offer_ids(goals: Iterable[Goal], status: ServerStatus, incomplete: str) -> Offers:
-    """Return the ids of goals as completions. If the user has typed digits, add short ids such as 12."""
+    """Return the ids of goals as completions.
+
+    If the user has typed digits, add short ids such as 12.
+    """
     own = f"{status.server.get('boot')}-" if incomplete.isascii() and incomplete.isdecimal() else ""
     return [(name, _goal_help(each)) for each in goals for name in dict.fromkeys((each.id.removeprefix(own), each.id))]
 

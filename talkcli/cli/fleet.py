@@ -73,7 +73,10 @@ def _watch(options: CommonOptions, broker: Broker, selection: Selection | None, 
 def _show_event(
     options: CommonOptions, broker: Broker, transcript: FleetTranscript, event: FleetEvent, output: Screen
 ) -> None:
-    """Print an event of the fleet. Messages about a lost or recovered broker go to standard error."""
+    """Print an event of the fleet.
+
+    Messages about a lost or recovered broker go to standard error.
+    """
     from talkcli.fleet.desk.watch import BrokerAway, EventsMissed, FleetSnapshot, RobotChanged, RobotEvent
 
     now = time.time()

@@ -103,7 +103,9 @@ class Interrupts:
         return kind is Interrupted
 
     def record(self, error: Interrupted | OSError) -> None:
-        """Record whether the output's reader is gone. If it is, discard all output. Re-raise unrelated errors.
+        """Record whether the output's reader is gone.
+
+        If it is, discard all output. Re-raise unrelated errors.
 
         The unrelated errors are those other than an interrupt, a timeout or a missing reader.
         """
@@ -117,7 +119,10 @@ class Interrupts:
             discard_output()
 
     def prepare_cleanup(self) -> None:
-        """Clear the interrupt so that the cleanup can wait. Only a new signal interrupts the cleanup."""
+        """Clear the interrupt so that the cleanup can wait.
+
+        Only a new signal interrupts the cleanup.
+        """
         if self.signal_number is not None:
             signal.set_wakeup_fd(-1)  # a second SIGHUP must not interrupt the cleanup
         self.watched.pop(STDOUT_FD, None)

@@ -155,7 +155,9 @@ def may_send_early(plain: PlainCommand) -> bool:
 
 
 def _connect_early(plain: PlainCommand, before_sending: Callable[[], None]) -> ConnectionAttempt | None:
-    """Connect and, if possible, send the request, without waiting for a slow server. Return the attempt.
+    """Connect and, if possible, send the request, without waiting for a slow server.
+
+    Return the attempt.
 
     Args:
         plain: the command.

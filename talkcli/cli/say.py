@@ -38,7 +38,9 @@ def say(
     output: str | None,
     **goal_options: Any,
 ) -> int:
-    """Speak a text or the lines of standard input, or write the speech to a file. Return the exit code.
+    """Speak a text or the lines of standard input, or write the speech to a file.
+
+    Return the exit code.
 
     Args:
         options: the options of every command.
@@ -101,7 +103,10 @@ def _read_input(
 
 
 def replace_and_report_bad_bytes(text: str, options: CommonOptions) -> str:
-    """Replace invalid UTF-8 in a text, and return it. Print a message about the change unless --quiet is given."""
+    """Replace invalid UTF-8 in a text, and return it.
+
+    Print a message about the change unless --quiet is given.
+    """
     text, problem = replace_bad_bytes(text)
     if problem and not options.quiet:
         note(problem)
@@ -123,7 +128,9 @@ def _report_sent(goal: GoalHandle, options: CommonOptions, reporter: GoalReporte
 def _wait_for_goal(
     goal: GoalHandle, interrupts: Interrupts, timeout: float | None, options: CommonOptions, reporter: GoalReporter
 ) -> int:
-    """Wait until a goal has ended, report it, and return the exit code. Cancel it on an interrupt or timeout.
+    """Wait until a goal has ended, report it, and return the exit code.
+
+    Cancel it on an interrupt or timeout.
 
     If an earlier command has already sent a goal with the same id, that goal isn't cancelled.
 
@@ -151,7 +158,10 @@ def _wait_for_goal(
 def _write_file(
     path: str, text: str, goal_options: Mapping[str, Any], timeout: float | None, options: CommonOptions
 ) -> int:
-    """Write the speech to a file, or to standard output if the path is "-". Return the exit code."""
+    """Write the speech to a file, or to standard output if the path is "-".
+
+    Return the exit code.
+    """
     from talkcli.engine.parent.render import STANDARD_OUTPUT, render
 
     settings, seconds_at_most = _sound_settings(goal_options), seconds_left(options.deadline(timeout))

@@ -86,7 +86,10 @@ def _warn_about_sound(player: str, driver: str | None) -> None:
 
 
 def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **given: Any) -> int:
-    """Run the bridge, or print its systemd unit or the broker's access rules. Return the exit code."""
+    """Run the bridge, or print its systemd unit or the broker's access rules.
+
+    Return the exit code.
+    """
     from talkcli.fleet import topics
     from talkcli.fleet.bridge.policy import ALLOWABLE_REQUESTS
 
@@ -125,7 +128,9 @@ def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **gi
 def _print_unit(
     options: CommonOptions, command: str, kind: str, given: Mapping[str, Any], arguments: Sequence[str], **values: str
 ) -> int:
-    """Print a systemd unit, and warn if the service's user can't access the program. Return the exit code.
+    """Print a systemd unit, and warn if the service's user can't access the program.
+
+    Return the exit code.
 
     Args:
         options: the common options, with the socket and the names of the options to copy into the unit.

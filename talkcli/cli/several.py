@@ -62,7 +62,10 @@ def say(
 
 
 def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None) -> int:
-    """Wait on each robot until the given goals, or all goals, have ended. Return the exit code."""
+    """Wait on each robot until the given goals, or all goals, have ended.
+
+    Return the exit code.
+    """
     discard_unread_output()
     return _send_request(options, Wait(ids or None), timeout)
 
@@ -73,12 +76,18 @@ def cancel(options: CommonOptions, ids: tuple[str, ...], current: bool, before: 
 
 
 def status(options: CommonOptions, goal_id: str | None, long: bool) -> int:  # noqa: ARG001 - ids are always whole
-    """Show the status of each robot, or the state of one goal on each robot. Return the exit code."""
+    """Show the status of each robot, or the state of one goal on each robot.
+
+    Return the exit code.
+    """
     return _send_request(options, Status(goal_id))
 
 
 def change(options: CommonOptions, **settings: Any) -> int:
-    """Change the given settings on each robot, or show all settings if none are given. Return the exit code."""
+    """Change the given settings on each robot, or show all settings if none are given.
+
+    Return the exit code.
+    """
     return _send_request(options, Set(**settings))
 
 
@@ -95,7 +104,9 @@ def resume(options: CommonOptions) -> int:
 def _send_request(
     options: CommonOptions, request: Request, timeout: float | None = None, name: str | None = None
 ) -> int:
-    """Send a request to the robots, print the outcomes, and return the exit code. Cancel its goals if interrupted.
+    """Send a request to the robots, print the outcomes, and return the exit code.
+
+    Cancel its goals if interrupted.
 
     Goals are only cancelled if the command waits for goals that it has sent itself. A timeout also interrupts the wait.
 
@@ -172,7 +183,10 @@ class _OutcomePrinter:
             self._clear_count()
 
     def _record(self, outcome: Outcome) -> None:
-        """Store a robot's latest outcome. An earlier failure is only replaced if it seemed to be final."""
+        """Store a robot's latest outcome.
+
+        An earlier failure is only replaced if it seemed to be final.
+        """
         before = self._outcomes.get(outcome.robot)
         # If a robot answers after a failure that seemed final, it only appeared to be absent. Replace the failure.
         if before is not None and before.exit_code and not before.last:
@@ -180,7 +194,9 @@ class _OutcomePrinter:
         self._outcomes[outcome.robot] = outcome
 
     def summarize(self, fleet_request: FleetRequest, unfinished_label: str = "not done") -> int:
-        """Print how many robots succeeded and why others failed, unless --quiet is given. Return the exit code.
+        """Print how many robots succeeded and why others failed, unless --quiet is given.
+
+        Return the exit code.
 
         Args:
             fleet_request: the request.
@@ -199,7 +215,10 @@ class _OutcomePrinter:
         return EXIT_DIFFER if len(codes) > 1 else next(iter(codes), EXIT_OK)
 
     def _print_outcome(self, outcome: Outcome) -> None:
-        """Print an outcome as JSON, as settings or as a line. With --quiet, leave out the line, except for `status`."""
+        """Print an outcome as JSON, as settings or as a line.
+
+        With --quiet, leave out the line, except for `status`.
+        """
         if self._options.json:
             show_if_possible(show_json, outcome.to_json())
         elif outcome.said and self._request == Set():

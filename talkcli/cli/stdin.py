@@ -153,7 +153,10 @@ class LineBuffer:
         return self._lines.popleft()
 
     def take_expired(self, now: float) -> Iterator[InputLine]:
-        """Remove and yield expired lines. A call yields at most 1,000, so that the caller can check for signals."""
+        """Remove and yield expired lines.
+
+        A call yields at most 1,000, so that the caller can check for signals.
+        """
         for _ in range(_MAX_EXPIRED_LINES):
             if not self.first or self.first.end > now:
                 break
@@ -161,7 +164,10 @@ class LineBuffer:
 
 
 def _read_available() -> bytes | None:
-    """Return data from standard input. It is b"" at the end of the input, and None if reading would block."""
+    """Return data from standard input.
+
+    It is b"" at the end of the input, and None if reading would block.
+    """
     try:
         return os.read(0, _STDIN_READ_BYTES)
     except BlockingIOError:  # another program has made standard input non-blocking
@@ -226,7 +232,10 @@ class LineSpeaker:
         self._failure: tuple[int, int] | None = None
 
     def run(self) -> int:
-        """Connect, send all lines and, with --wait, wait until their goals have ended. Return the exit code."""
+        """Connect, send all lines and, with --wait, wait until their goals have ended.
+
+        Return the exit code.
+        """
         interrupts = self._interrupts
         try:
             with (
@@ -244,7 +253,10 @@ class LineSpeaker:
         return interrupts.exit_code
 
     def _run_connected(self) -> int:
-        """Send all lines and follow their goals until done or interrupted. Report errors, and return the exit code."""
+        """Send all lines and follow their goals until done or interrupted.
+
+        Report errors, and return the exit code.
+        """
         try:
             while not self._done:
                 try:
@@ -328,7 +340,10 @@ class LineSpeaker:
     # Sending lines
 
     def _send_line(self, line: InputLine) -> None:
-        """Send a line as a goal, without waiting for the answer. Report a line that is too long as rejected."""
+        """Send a line as a goal, without waiting for the answer.
+
+        Report a line that is too long as rejected.
+        """
         if line.oversize_bytes:
             words = f"the line has {line.oversize_bytes:,} bytes, but at most {MAX_TEXT_BYTES:,} are allowed"
             self._report_rejected(line.number, rejected_goal(words))
@@ -349,7 +364,10 @@ class LineSpeaker:
         self._unanswered = handle, self._connection.begin(request, accepted)
 
     def _process_answer(self) -> None:
-        """If the server has answered the last line, report whether its goal was accepted. Follow an accepted goal."""
+        """If the server has answered the last line, report whether its goal was accepted.
+
+        Follow an accepted goal.
+        """
         if self._unanswered is None or not self._unanswered[1].over:
             return
         (handle, exchange), number = self._unanswered, self._sending or 0
@@ -373,7 +391,10 @@ class LineSpeaker:
         self._record_failure(number, self._call_writer(self._reporter.report_refused, goal, f"line {number}: "))
 
     def _report_expired(self, line: InputLine) -> None:
-        """Report a line that expired before it was sent. With --wait, also record this as a failure."""
+        """Report a line that expired before it was sent.
+
+        With --wait, also record this as a failure.
+        """
         words = f"line {line.number} was not sent: its ttl of {format_number(self._ttl)} s is over"
         goal = Goal("", State.RECALLED, text=line.text, reason="expired", message=words)
         code = self._call_writer(self._reporter.report_refused, goal)
@@ -386,7 +407,10 @@ class LineSpeaker:
             self._failure = number, code
 
     def _call_writer(self, write: Callable[..., _T], *given: object) -> _T:
-        """Call a function that writes output, and return its result. Without --wait, ignore a missing reader."""
+        """Call a function that writes output, and return its result.
+
+        Without --wait, ignore a missing reader.
+        """
         return write(*given) if self._wait else retry_without_output(write, *given)
 
     # Waiting for input and for the server
@@ -429,7 +453,10 @@ class LineSpeaker:
             watched.pop(0, None)
 
     def _report_goals(self) -> None:
-        """Forget goals that have ended. With --wait, first report their events in the order of the lines."""
+        """Forget goals that have ended.
+
+        With --wait, first report their events in the order of the lines.
+        """
         if not self._wait:
             self._goals = deque(each for each in self._goals if not each[1].state.terminal)
             return

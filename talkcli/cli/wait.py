@@ -34,7 +34,10 @@ def seconds_left(end: float | None) -> float | None:
 
 
 def timeout_error(timeout: float | None, details: str = "") -> TimedOut:
-    """Return the error to raise when --timeout has expired. `details` is added to its message."""
+    """Return the error to raise when --timeout has expired.
+
+    `details` is added to its message.
+    """
     return TimedOut(f"timed out after {format_number(timeout or 0)} s{details and f': {details}'}")
 
 
@@ -63,7 +66,9 @@ class GoalReporter:
             self.feedback.note("speech is paused; continue with: talk resume")
 
     def follow(self, goals: Sequence[GoalHandle], timeout: float | None) -> None:
-        """Show the events of these goals until they have ended. Raise TimeoutError if they don't end in time.
+        """Show the events of these goals until they have ended.
+
+        Raise TimeoutError if they don't end in time.
 
         Raises:
             TimeoutError: the goals haven't ended in time.
@@ -85,7 +90,9 @@ class GoalReporter:
         return self.report(goal, prefix)
 
     def report(self, goal: Goal, prefix: str = "") -> int:
-        """With --json, print a goal. If it failed, print why. Return its exit code, or 124 if it is unfinished.
+        """With --json, print a goal.
+
+        If it failed, print why. Return its exit code, or 124 if it is unfinished.
 
         `prefix` is put in front of any message.
         """
@@ -124,7 +131,10 @@ class GoalReporter:
 
 
 def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None, feedback: bool) -> int:
-    """Wait until the given goals, or all unfinished goals, have ended. Report failures, and return the exit code."""
+    """Wait until the given goals, or all unfinished goals, have ended.
+
+    Report failures, and return the exit code.
+    """
     end = options.deadline(timeout)
     discard_unread_output()
     with Interrupts(output=True) as interrupts, options.connect(timeout, interrupt=interrupts.watched) as client:

@@ -131,7 +131,9 @@ class Client:
         patient: bool = False,
         block: bool = True,
     ) -> GoalHandle:
-        """Send a goal, and return its handle. With `block`, wait until the server has accepted or REJECTED it.
+        """Send a goal, and return its handle.
+
+        With `block`, wait until the server has accepted or REJECTED it.
 
         Args:
             text: the text to speak, up to 10,000 characters.
@@ -235,7 +237,9 @@ class Client:
         before: str | None = None,
         key: str | None = None,
     ) -> Canceled:
-        """Cancel goals, and return them when they are silent. Without arguments, cancel all goals.
+        """Cancel goals, and return them when they are silent.
+
+        Without arguments, cancel all goals.
 
         A goal is cancelled if any of the arguments selects it.
 
@@ -403,14 +407,20 @@ class Client:
         return handle, accepted
 
     def _full_id(self, goal_id: str) -> str:
-        """Return an id, prefixed with the boot id if it is only a number. Raises the same errors as `check_id`."""
+        """Return an id, prefixed with the boot id if it is only a number.
+
+        Raises the same errors as `check_id`.
+        """
         if goal_id.isascii() and goal_id.isdecimal():
             goal_id = f"{self._first_boot}-{goal_id}"
         check_id(goal_id)
         return goal_id
 
     def _take_all(self, buffer: EventBuffer) -> Iterator[Event]:
-        """Yield the events of a buffer as they arrive. Raises Lost when the buffer or the connection is closed."""
+        """Yield the events of a buffer as they arrive.
+
+        Raises Lost when the buffer or the connection is closed.
+        """
         for event in take_repeatedly(self._connection, lambda: buffer.take() or buffer.closed, None):
             if event is None or isinstance(event, str):
                 break

@@ -109,7 +109,9 @@ def _check_owner(connected: _socket.socket) -> None:
 def send_early(
     attempt: ConnectionAttempt, hello: JsonObject, request: JsonObject, before: Callable[[], None]
 ) -> ConnectionAttempt | None:
-    """Send hello, and the first request if the greeting arrives soon. Return the new state, or None if disconnected.
+    """Send hello, and the first request if the greeting arrives soon.
+
+    Return the new state, or None if disconnected.
 
     The request is not sent if the greeting is late or unexpected.
 
@@ -144,7 +146,9 @@ def send_early(
 
 
 def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> None:
-    """Sleep for a moment, so that the server can use the processor. Return early if the goal will not be spoken.
+    """Sleep for a moment, so that the server can use the processor.
+
+    Return early if the goal will not be spoken.
 
     A client that only waits for the end of its goal calls this before its other imports. The server, the engine, the
     player and the sound server need the processor until the first sound. Together they use about as much processor time
@@ -197,7 +201,9 @@ def connect(
     keep_trying: float = 0.0,
     end: float | None = None,
 ) -> ConnectionAttempt:
-    """Connect to the first usable server, read its greeting, and return the attempt. Retry for a limited time.
+    """Connect to the first usable server, read its greeting, and return the attempt.
+
+    Retry for a limited time.
 
     Args:
         named: path of the only socket to try; None for the usual places.

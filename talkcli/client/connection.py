@@ -41,7 +41,10 @@ _RECONNECT_PAUSE_S = 0.1
 
 
 def checked_sender_name(name: str | None) -> str | None:
-    """Return the given name or the one in TALK_NAME, if there is one. Raises UsageError if the name is too long."""
+    """Return the given name or the one in TALK_NAME, if there is one.
+
+    Raises UsageError if the name is too long.
+    """
     name = sender_name(name)
     if name and len(name) > MAX_SENDER_NAME_CHARS:
         raise UsageError(f"the sender's name is too long: {len(name)} characters (at most {MAX_SENDER_NAME_CHARS})")
@@ -49,7 +52,9 @@ def checked_sender_name(name: str | None) -> str | None:
 
 
 def take_repeatedly(connection: Connection, take: Callable[[], _T], end: float | None) -> Iterator[_T]:
-    """Call `take` repeatedly, and yield its results. While there is no result, wait for the server.
+    """Call `take` repeatedly, and yield its results.
+
+    While there is no result, wait for the server.
 
     An empty result is yielded if `end` has passed or the connection has ended. Nothing more is received after `end`, so
     that a loop over the results ends even if the server keeps sending events.
@@ -98,7 +103,10 @@ class Connection(ClientCore):
     exchange_type = Exchange
 
     def __init__(self, patience: float) -> None:
-        """Initialize a connection. The server must answer each request within `patience` seconds."""
+        """Initialize a connection.
+
+        The server must answer each request within `patience` seconds.
+        """
         super().__init__(patience, time.monotonic())
         #: protects all state, and is notified after messages have been processed
         self.changed = threading.Condition()
@@ -168,7 +176,9 @@ class Connection(ClientCore):
         return exchange
 
     def submit(self, request: Request, on_reply: OnReply, on_failure: OnFailure) -> None:
-        """Send a request without blocking. Later calls send the bytes that the server doesn't accept now.
+        """Send a request without blocking.
+
+        Later calls send the bytes that the server doesn't accept now.
 
         One of the two functions is called during this call or a later one, while the lock `changed` is held.
 
@@ -194,7 +204,9 @@ class Connection(ClientCore):
         since: float | None = None,
         interruptible: bool = True,
     ) -> bool:
-        """Process messages until `done()` is true. Return False if the deadline passes or the connection ends first.
+        """Process messages until `done()` is true.
+
+        Return False if the deadline passes or the connection ends first.
 
         If the server is silent for too long, the connection ends.
 
@@ -253,7 +265,10 @@ class Connection(ClientCore):
             self.wait_until(lambda: False, time.monotonic(), interruptible=False)
 
     def _cut_off(self) -> None:
-        """Break the connection, because a line could only be sent in part. The caller must hold the lock `changed`."""
+        """Break the connection, because a line could only be sent in part.
+
+        The caller must hold the lock `changed`.
+        """
         self.break_off(f"the server accepted no data for {self._patience:g} s", time.monotonic())
 
     # -- methods that each transport implements. Callers of `_send` and `_hang_up` hold the lock `changed`.
@@ -281,7 +296,10 @@ class Connection(ClientCore):
         raise NotImplementedError
 
     def _drop(self) -> None:
-        """Close this process's copies of the descriptors. A parent process keeps its own copies."""
+        """Close this process's copies of the descriptors.
+
+        A parent process keeps its own copies.
+        """
         raise NotImplementedError
 
 
@@ -344,7 +362,10 @@ class SocketConnection(Connection):
         self._flush()
 
     def _flush(self) -> None:
-        """Send as many bytes as the server accepts now. The caller must hold the lock `changed`."""
+        """Send as many bytes as the server accepts now.
+
+        The caller must hold the lock `changed`.
+        """
         try:
             while self._socket is not None and (data := self.outgoing()):
                 self.mark_sent(self._socket.send(data))
@@ -428,7 +449,10 @@ class ReconnectingConnection(SocketConnection):
         return super().begin(request, on_reply, on_failure)
 
     def break_off(self, why: str, now: float) -> None:
-        """Disconnect, and schedule an attempt to reconnect. Do nothing if the connection has ended for good."""
+        """Disconnect, and schedule an attempt to reconnect.
+
+        Do nothing if the connection has ended for good.
+        """
         if self.ended is not None:
             return
         was_greeted = self.greeted
@@ -458,7 +482,10 @@ class ReconnectingConnection(SocketConnection):
                 polled.close()
 
     def receive(self, data: bytes, now: float) -> None:
-        """Process received bytes. If the greeting refuses this client, disconnect and try again later."""
+        """Process received bytes.
+
+        If the greeting refuses this client, disconnect and try again later.
+        """
         try:
             super().receive(data, now)
         except TalkError as error:  # the greeting shows that the server can't be used
@@ -466,7 +493,10 @@ class ReconnectingConnection(SocketConnection):
             self._schedule_retry(error, now)
 
     def _connect_again(self, now: float, *, at_once: bool = False) -> None:
-        """Reconnect if disconnected and the pause between attempts is over. `at_once` ignores the pause."""
+        """Reconnect if disconnected and the pause between attempts is over.
+
+        `at_once` ignores the pause.
+        """
         if self._socket is not None or (now < self._due and not at_once):
             return
         found = reach(self._named, only=self.path)
@@ -483,7 +513,9 @@ class ReconnectingConnection(SocketConnection):
         self.not_connected(error)
 
     def _give_up_socket(self) -> None:
-        """Disconnect. If a thread is reading, that thread closes the socket, because it may still be polling it.
+        """Disconnect.
+
+        If a thread is reading, that thread closes the socket, because it may still be polling it.
 
         The caller must hold the lock `changed`.
         """

@@ -71,7 +71,9 @@ class EventBuffer:
         self.reconnects = reconnects
 
     def add(self, event: Event) -> None:
-        """Add an event unless it is a duplicate. Close the buffer if too many state changes are unread.
+        """Add an event unless it is a duplicate.
+
+        Close the buffer if too many state changes are unread.
 
         A connection that waits for a goal and also watches all goals receives each state twice.
         """
@@ -117,7 +119,10 @@ class EventListeners:
         return {goal_id: any(each._with_feedback for each in some) for goal_id, some in self._goals.items()}
 
     def lose(self, goal_id: str, why: str) -> None:
-        """End a followed goal as LOST, and stop following it. `why` is a human-readable reason."""
+        """End a followed goal as LOST, and stop following it.
+
+        `why` is a human-readable reason.
+        """
         for tracked in self._goals.pop(goal_id, set()):
             tracked._mark_lost(why)
 
@@ -244,12 +249,17 @@ class TrackedGoal:
         return self.goal.state.terminal or bool(self._buffer)
 
     def _take(self) -> Event | None:
-        """Remove and return the oldest event, or the Result after the last event. Return None if nothing is new."""
+        """Remove and return the oldest event, or the Result after the last event.
+
+        Return None if nothing is new.
+        """
         return self._buffer.take() or (Result(self.goal) if self.goal.state.terminal else None)
 
 
 def read_greeting(line: bytes, path: str) -> tuple[str, int | None]:
-    """Return the boot id and process id in a server's first line. Raises an error if the server can't be used.
+    """Return the boot id and process id in a server's first line.
+
+    Raises an error if the server can't be used.
 
     Raises:
         ServerUnavailable: the line is not a greeting.
@@ -414,7 +424,9 @@ class ClientCore:
         self._first_sent_bytes = count
 
     def forget(self, exchange: Exchange) -> bool:
-        """Stop waiting for an answer, and remove the request if it is unsent. Return False if part of it was sent.
+        """Stop waiting for an answer, and remove the request if it is unsent.
+
+        Return False if part of it was sent.
 
         Returns:
             False if a part of the line has been sent. The connection must then be closed before the newline is sent,
@@ -430,7 +442,10 @@ class ClientCore:
         return True
 
     def stop_sending(self, why: str) -> None:
-        """Fail all unsent and later requests, for this reason. Answers to earlier requests can still be received."""
+        """Fail all unsent and later requests, for this reason.
+
+        Answers to earlier requests can still be received.
+        """
         self._sending_ended = self._sending_ended or why
         unsent = [exchange for _, exchange in self._unsent]
         self._drop_unsent_lines()
@@ -465,7 +480,10 @@ class ClientCore:
         return Lost(words) if isinstance(request, self.lasting) else ServerUnavailable(words)
 
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
-        """Return the error for a reply that refuses a request. `items` are the list items before the reply."""
+        """Return the error for a reply that refuses a request.
+
+        `items` are the list items before the reply.
+        """
         from talkcli.terminal.text import printable  # rarely needed, and slow to import
 
         error = reply.get("error")
@@ -503,7 +521,9 @@ class ClientCore:
         return min(times, default=float("inf"))
 
     def expire(self, now: float) -> bool:
-        """Fail late requests, and end goals after a long disconnection. Return False if the connection must be closed.
+        """Fail late requests, and end goals after a long disconnection.
+
+        Return False if the connection must be closed.
 
         Returns:
             False if the connection must be closed, because a part of a line has been sent (see `forget`).
@@ -554,7 +574,9 @@ class ClientCore:
         return self.exchanges.get(number) if isinstance(number, int) else None
 
     def dispatch(self, message: JsonObject, now: float) -> Exchange | None:
-        """Process a received event, list item or reply. Return the exchange that a reply has ended, if any.
+        """Process a received event, list item or reply.
+
+        Return the exchange that a reply has ended, if any.
 
         Raises:
             ValueError: the event, or a goal in the reply, is malformed.
@@ -575,7 +597,9 @@ class ClientCore:
         return exchange
 
     def _finish(self, exchange: Exchange, reply: JsonObject) -> None:
-        """End an exchange with its reply, or with an error if the reply is a refusal. Calls the callbacks.
+        """End an exchange with its reply, or with an error if the reply is a refusal.
+
+        Calls the callbacks.
 
         Raises:
             Unreadable: a goal in the reply is malformed.
@@ -601,14 +625,20 @@ class ClientCore:
         self.end(why)
 
     def end(self, why: str) -> None:
-        """End the connection for good, and fail all unanswered requests. Received events can still be read."""
+        """End the connection for good, and fail all unanswered requests.
+
+        Received events can still be read.
+        """
         if self.ended is not None:
             return
         self.ended = self._last_error or why
         self._fail_all()
 
     def disconnected(self, why: str, now: float) -> None:
-        """Record that the connection has broken. Fail unanswered requests, and end watches that don't reconnect."""
+        """Record that the connection has broken.
+
+        Fail unanswered requests, and end watches that don't reconnect.
+        """
         self.absence = self._last_error or why
         self.absent_since, self._last_error, self._sending_ended = now, None, None
         self.greeted = False
@@ -618,7 +648,10 @@ class ClientCore:
         self.listeners.end_watches(why, include_reconnecting=False)
 
     def connecting(self, hello: bytes) -> None:
-        """Prepare for a new connection, on which `hello` is sent first. Requests wait for the server's greeting."""
+        """Prepare for a new connection, on which `hello` is sent first.
+
+        Requests wait for the server's greeting.
+        """
         self.greeted, self._hello = False, hello
         self.begin_stream()
 
@@ -630,7 +663,9 @@ class ClientCore:
             self.fail(exchange, error)
 
     def connected(self, boot: str, pid: int | None, now: float) -> None:
-        """Record the greeting on a new connection. Follow all goals again, or end them as LOST.
+        """Record the greeting on a new connection.
+
+        Follow all goals again, or end them as LOST.
 
         Goals are followed again if the server wasn't restarted in the meantime. Otherwise they are LOST.
 

@@ -28,7 +28,9 @@ if TYPE_CHECKING:
 
 
 class GoalHandle(TrackedGoal):
-    """A handle for a goal that this client has sent or follows. Any number of threads may use it.
+    """A handle for a goal that this client has sent or follows.
+
+    Any number of threads may use it.
 
     Events are buffered until they are read. If there are more than 5,000 words and pauses, the oldest are dropped.
     `events`, `feedback` and `poll` read from the same buffer, so each event is returned only once. A new loop continues
@@ -48,11 +50,16 @@ class GoalHandle(TrackedGoal):
 
     @property
     def state(self) -> State:
-        """The goal's last known state. Calls that read from the server update it, for example `wait` and `poll`."""
+        """The goal's last known state.
+
+        Calls that read from the server update it, for example `wait` and `poll`.
+        """
         return self.goal.state
 
     def wait(self, timeout: float | None = None) -> Goal:
-        """Wait until the goal has ended, and return it. Raise TimeoutError if `timeout` expires first.
+        """Wait until the goal has ended, and return it.
+
+        Raise TimeoutError if `timeout` expires first.
 
         If the goal can no longer be followed, for example because the server was restarted, the goal ends as LOST. It
         may or may not have been spoken.
@@ -102,7 +109,9 @@ class GoalHandle(TrackedGoal):
         return (each for each in self._iterate_events(end, timeout) if isinstance(each, WordHeard))
 
     def poll(self) -> Event | None:
-        """Read from the server without blocking. Return the goal's next event, or None if there is none.
+        """Read from the server without blocking.
+
+        Return the goal's next event, or None if there is none.
 
         The Result is the last event. Call this method regularly, because each call also receives the events of other
         goals, and sends the rest of earlier requests.
@@ -156,11 +165,17 @@ class GoalHandle(TrackedGoal):
     # -- internal
 
     def _listen(self, *, feedback: bool) -> None:
-        """Register for the goal's events, optionally with words. The caller must hold the connection's lock."""
+        """Register for the goal's events, optionally with words.
+
+        The caller must hold the connection's lock.
+        """
         self._listen_to(self._connection.listeners, feedback=feedback, now=time.monotonic())
 
     def _iterate_events(self, end: float | None, timeout: float | None) -> Iterator[Event]:
-        """Yield the goal's events up to its Result. Raises TimeoutError if `end` (monotonic) passes first."""
+        """Yield the goal's events up to its Result.
+
+        Raises TimeoutError if `end` (monotonic) passes first.
+        """
         for event in take_repeatedly(self._connection, self._take, end):
             if event is None:
                 self._give_up(timeout)
@@ -188,7 +203,10 @@ class GoalHandle(TrackedGoal):
             raise TimeoutError(f"goal {self.id} has not ended after {0 if timeout is None else round(timeout, 1):g} s")
 
     def _lose_if_disconnected(self) -> bool:
-        """End the goal as LOST if the connection has ended. Return whether the connection has ended."""
+        """End the goal as LOST if the connection has ended.
+
+        Return whether the connection has ended.
+        """
         ended = self._connection.ended
         if ended is not None:
             with self._connection.changed:
@@ -236,7 +254,10 @@ class _EventStream:
         self._last_pause = 0
 
     def take(self) -> list[tuple[GoalHandle, Event]]:
-        """Remove and return the new events of all goals in order. The caller must hold the connection's lock."""
+        """Remove and return the new events of all goals in order.
+
+        The caller must hold the connection's lock.
+        """
         found: list[tuple[int, GoalHandle, Event]] = []
         for handle in self.unfinished:
             event: Event | None = None

@@ -41,7 +41,9 @@ class RateLimit:
         self._event_count = 0
 
     def count_event(self, now: float) -> int | None:
-        """Count an event. Return how many events were suppressed before it, or None if it must be suppressed.
+        """Count an event.
+
+        Return how many events were suppressed before it, or None if it must be suppressed.
 
         If the event is allowed, return how many events have been suppressed since the last allowed event.
         """
@@ -60,7 +62,10 @@ _rate_limits: dict[str, RateLimit] = {}
 
 
 def write(message: str) -> None:
-    """Write a line to the log. The line is dropped if standard error can't accept it at once."""
+    """Write a line to the log.
+
+    The line is dropped if standard error can't accept it at once.
+    """
     global _lost_lines  # noqa: PLW0603
     if _lost_lines:
         message = f"{message} ({_lost_lines} lines before this one could not be written)"

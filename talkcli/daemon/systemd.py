@@ -119,7 +119,10 @@ class ServiceManager:
 
 
 def _parse_notify_address(value: str) -> str:
-    """Convert the value of NOTIFY_SOCKET to a socket address. Return "" if it is unset or invalid."""
+    """Convert the value of NOTIFY_SOCKET to a socket address.
+
+    Return "" if it is unset or invalid.
+    """
     if value.startswith("@"):
         return "\0" + value[1:]  # an abstract socket, which Linux names with @
     return value if os.path.isabs(value) else ""

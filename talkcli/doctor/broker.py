@@ -98,7 +98,10 @@ class BrokerExamination:
         self.question = BRIDGE_QUESTION if self._is_robot else ROBOT_QUESTION
 
     def findings(self) -> Iterator[Finding]:
-        """Run the checks, and yield their findings. Stop at a failure that makes further checks impossible."""
+        """Run the checks, and yield their findings.
+
+        Stop at a failure that makes further checks impossible.
+        """
         try:
             broker = from_environment(self._environment, insecure=self._insecure)
             name, context = client_user(broker), broker.ssl_context()
@@ -153,7 +156,10 @@ class BrokerExamination:
             yield judge_certificate(broker, expires_at, time.time())
 
     def _log_in(self, broker: Broker) -> Link:
-        """Connect to the broker, log in, and return the connection. Raises the same errors as `Link.open`."""
+        """Connect to the broker, log in, and return the connection.
+
+        Raises the same errors as `Link.open`.
+        """
         name = f"talk-doctor-{os.urandom(8).hex()}"
         link = Link(broker, name, self._inbox.append, receive_maximum=MAX_RECEIVE_COUNT)
         try:
@@ -163,7 +169,10 @@ class BrokerExamination:
         return link
 
     def _check_anonymous(self, broker: Broker) -> Finding:
-        """Try to log in without credentials, and return the finding. It is a warning if the broker allows this."""
+        """Try to log in without credentials, and return the finding.
+
+        It is a warning if the broker allows this.
+        """
         try:
             self._log_in(replace(broker, user=None, password=None, cert=None, key=None)).close()
         except TalkError:
@@ -172,7 +181,9 @@ class BrokerExamination:
         return warning("anonymous", words, "allow_anonymous false in mosquitto.conf; then: talk bridge --print-acl")
 
     def _test_rights(self, link: Link, user: str) -> tuple[Finding, dict[str, Presence]]:
-        """Publish messages to test the user's rights. Return the finding, and the presences of robots by name.
+        """Publish messages to test the user's rights.
+
+        Return the finding, and the presences of robots by name.
 
         The user needs the rights of an operator, or those of this robot's bridge. Other robots are only read if this
         robot's presence is missing, and the user isn't the robot.
@@ -285,7 +296,10 @@ def judge_settings(message: str, *, has_url: bool) -> Finding:
 
 
 def judge_unreachable(broker: Broker, reason: str) -> Finding:
-    """Return the finding about a broker that can't be reached. `reason` is a text of `_explain_error`."""
+    """Return the finding about a broker that can't be reached.
+
+    `reason` is a text of `_explain_error`.
+    """
     step = _UNREACHABLE_STEPS.get(reason, _UNREACHABLE_STEPS[_NO_ANSWER])
     return failure("broker", f"{broker.url}: {reason}", step.format(host=broker.host, port=broker.port))
 
@@ -329,7 +343,10 @@ def _describe_cas(broker: Broker) -> str:
 
 
 def _advise_on_tls_error(broker: Broker, message: str, code: int, now: float) -> str:
-    """Return advice on how to fix a TLS error. The arguments are those of `judge_tls_error`."""
+    """Return advice on how to fix a TLS error.
+
+    The arguments are those of `judge_tls_error`.
+    """
     if code in _DATE_CODES:
         clock = time.strftime("%Y-%m-%d %H:%M", time.gmtime(now))
         return f"renew the certificate of {broker.host}; or set this machine's clock, which shows {clock} UTC"
@@ -344,7 +361,10 @@ def _advise_on_tls_error(broker: Broker, message: str, code: int, now: float) ->
 
 
 def judge_login(broker: Broker, refusal: str | None) -> Finding:
-    """Return the finding about the login. `refusal` is the broker's reason for refusing it, or None."""
+    """Return the finding about the login.
+
+    `refusal` is the broker's reason for refusing it, or None.
+    """
     if refusal is not None:
         wrong, _, remedy = refusal.partition("; ")
         step = _LOG_STEP

@@ -74,7 +74,10 @@ class LocalExamination:
                 yield finding
 
     def _run_checks(self, client: Client | None, socket_finding: Finding) -> Iterator[Finding]:
-        """Run all checks, and yield their findings. The arguments are the results of `server.connect`."""
+        """Run all checks, and yield their findings.
+
+        The arguments are the results of `server.connect`.
+        """
         of_server: list[Finding] = []
         if client is not None:
             try:
@@ -103,7 +106,10 @@ class LocalExamination:
         yield self._speak_sentence()
 
     def _setting(self, name: str, variable: str = "") -> str | None:
-        """Return a server setting, or an environment variable if there is no server. Return None if it isn't set."""
+        """Return a server setting, or an environment variable if there is no server.
+
+        Return None if it isn't set.
+        """
         value = self._server.get(name) if self._server else os.environ.get(variable)
         return str(value) if value else None
 

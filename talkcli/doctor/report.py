@@ -64,12 +64,18 @@ def ok(check: str, message: str) -> Finding:
 
 
 def warning(check: str, message: str, step: str) -> Finding:
-    """Return a finding about a fault that may prevent sound. `step` is what the user should do next."""
+    """Return a finding about a fault that may prevent sound.
+
+    `step` is what the user should do next.
+    """
     return Finding(check, WARNING, printable(message), printable(step))
 
 
 def failure(check: str, message: str, step: str) -> Finding:
-    """Return a finding about a fault that certainly prevents sound. `step` is what the user should do next."""
+    """Return a finding about a fault that certainly prevents sound.
+
+    `step` is what the user should do next.
+    """
     return Finding(check, FAILURE, printable(message), printable(step))
 
 
@@ -115,7 +121,10 @@ def format_conclusion(findings: Sequence[Finding], screen: Screen, question: Que
 
 
 def _wrap(text: str, room: int | None) -> list[str]:
-    """Split a text into lines of at most `room` characters. If `room` is None, return a single line."""
+    """Split a text into lines of at most `room` characters.
+
+    If `room` is None, return a single line.
+    """
     if room is None:
         return [text]
     # Don't break words at hyphens, because users copy paths and commands.

@@ -90,7 +90,10 @@ class SentenceResult:
 
 
 def speak_by_server(client: Client, text: str, limit: float) -> SentenceResult:
-    """Speak a sentence through the server, and return how it ended. Cancel it after `limit` seconds."""
+    """Speak a sentence through the server, and return how it ended.
+
+    Cancel it after `limit` seconds.
+    """
     try:
         goal = client.say(text, preempt=False, ttl=0)
         try:
@@ -132,7 +135,10 @@ def _goal_result(goal: Goal) -> SentenceResult:
 
 
 def speak_beside_server(client: Client, options: EngineOptions, limit: float) -> SentenceResult:
-    """Play a silent sentence with the doctor's own engine. Return how it ended, and whether the server also spoke."""
+    """Play a silent sentence with the doctor's own engine.
+
+    Return how it ended, and whether the server also spoke.
+    """
     try:
         before = client.status()
         result = speak_by_engine(SILENT_TEXT, options, 0.0, limit)
@@ -145,7 +151,10 @@ def speak_beside_server(client: Client, options: EngineOptions, limit: float) ->
 
 
 def speak_by_engine(text: str, options: EngineOptions, volume: float, limit: float) -> SentenceResult:
-    """Speak a sentence with the doctor's own engine, and return how it ended. Give up after `limit` seconds."""
+    """Speak a sentence with the doctor's own engine, and return how it ended.
+
+    Give up after `limit` seconds.
+    """
     try:
         with start_engine(options, limit) as engine:
             player = engine.wait_for(protocol.Ready).player

@@ -83,7 +83,9 @@ class SocketPlace:
 
 
 def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Client | None, Finding]:
-    """Connect to the server. Return the client, if connected, and the finding about the server's socket.
+    """Connect to the server.
+
+    Return the client, if connected, and the finding about the server's socket.
 
     The client is None if no connection was possible.
 
@@ -195,7 +197,10 @@ def _format_place(place: SocketPlace) -> str:
 
 
 def _advise_on_missing_server(places: list[SocketPlace], named_by: str | None, code: str) -> str:
-    """Return advice for a user whose server wasn't found. `code` is the code of the client's error."""
+    """Return advice for a user whose server wasn't found.
+
+    `code` is the code of the client's error.
+    """
     for each in paths.client_sockets(None) if named_by else []:
         if _probe_path(each, set()).what == PLACE_LISTENING:
             return f"{_UNNAMING[named_by]}: a server is running on {each}"
@@ -258,7 +263,10 @@ def summarize_server(server: JsonObject) -> str:
 
 
 def _judge_settings(server: JsonObject) -> Finding:
-    """Return the finding about a server's settings. It is a warning or failure if the volume is too low."""
+    """Return the finding about a server's settings.
+
+    It is a warning or failure if the volume is too low.
+    """
     volume = server.get("volume")
     lead_in = [f"lead-in {server['lead_in']} ms"] if server.get("lead_in") else []
     words = ", ".join([*describe_settings(server), *lead_in])
@@ -269,7 +277,10 @@ def _judge_settings(server: JsonObject) -> Finding:
 
 
 def _judge_recent(goals: Sequence[Goal], now: float, server: JsonObject) -> Finding:
-    """Return the finding about recent goals. It is a warning if no goal has succeeded since the last failure."""
+    """Return the finding about recent goals.
+
+    It is a warning if no goal has succeeded since the last failure.
+    """
     if not goals:
         return ok(_RECENT_CHECK, "no goals yet")
     aborted = [each for each in goals if each.state is State.ABORTED]
@@ -289,7 +300,10 @@ def _judge_recent(goals: Sequence[Goal], now: float, server: JsonObject) -> Find
 
 
 def format_span(seconds: object) -> str:
-    """Format a duration in a suitable unit, such as "3 min". Return "?" if it isn't a number."""
+    """Format a duration in a suitable unit, such as "3 min".
+
+    Return "?" if it isn't a number.
+    """
     if not isinstance(seconds, int | float):
         return "?"
     for unit, length in (("d", 86400), ("h", 3600), ("min", 60)):

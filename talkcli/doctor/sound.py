@@ -172,7 +172,10 @@ def _read_environment(pid: int) -> dict[str, str] | None:
 
 
 def _name_or_id(look_up: Callable[[int], tuple[Any, ...]], number: int) -> str:
-    """Return the name of a user or group, or the id if it has no name. `look_up` is `getpwuid` or `getgrgid`."""
+    """Return the name of a user or group, or the id if it has no name.
+
+    `look_up` is `getpwuid` or `getgrgid`.
+    """
     try:
         return str(look_up(number)[0])
     except KeyError:
@@ -327,7 +330,10 @@ DEVICE_LISTS: dict[str, tuple[str, Callable[[ProgramOutput], Iterable[str]], str
 
 
 def add_pactl_hint(finding: Finding, env: Mapping[str, str]) -> Finding:
-    """Return a finding. If its advice uses pactl and pactl is missing, add a hint on how to install pactl."""
+    """Return a finding.
+
+    If its advice uses pactl and pactl is missing, add a hint on how to install pactl.
+    """
     if finding.next is None or "pactl " not in finding.next or on_path("pactl", env):
         return finding
     return replace(finding, next=f"{finding.next} (to install pactl: sudo apt-get install -y {PACKAGES['pacat']})")
@@ -412,7 +418,9 @@ def _read_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[st
 
 
 def judge_level(name: str, text: str, unmute_command: str, louder_command: str, *, is_used: bool) -> Finding:
-    """Return the finding about the volume of one output. If its channels differ, the loudest one counts.
+    """Return the finding about the volume of one output.
+
+    If its channels differ, the loudest one counts.
 
     Args:
         name: the name of the sink or the mixer control.

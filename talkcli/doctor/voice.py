@@ -249,7 +249,10 @@ def _check_voice_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
 
 
 def _find_package_fault(env: Mapping[str, str]) -> tuple[str, str] | None:
-    """Test the packages of neural voices. Return an error message and advice, or None if they can be imported."""
+    """Test the packages of neural voices.
+
+    Return an error message and advice, or None if they can be imported.
+    """
     missing = models.missing_package()
     if missing is not None:
         return _split_advice(missing)
@@ -280,7 +283,10 @@ def _split_advice(message: str) -> tuple[str, str]:
 
 
 def _try_voice(voice: str, options: EngineOptions, limit: float) -> VoiceTrial:
-    """Load a voice, and return how fast it speaks a sentence, or why it failed. Nothing is played."""
+    """Load a voice, and return how fast it speaks a sentence, or why it failed.
+
+    Nothing is played.
+    """
     try:
         with open(os.devnull, "wb") as output, start_engine(options, limit, output.fileno()) as engine:
             engine.wait_for(protocol.Ready)
@@ -299,7 +305,10 @@ def _try_voice(voice: str, options: EngineOptions, limit: float) -> VoiceTrial:
 
 
 def _speak(engine: PrivateEngine, voice: str, text: str) -> tuple[protocol.Ended, float | None]:
-    """Speak a text, and return how it ended. Also return the voice's loading time, or None if it was already loaded."""
+    """Speak a text, and return how it ended.
+
+    Also return the voice's loading time, or None if it was already loaded.
+    """
     load_s = None
     # Set `voice_only`, because otherwise espeak would speak if the voice isn't loaded.
     engine.speak(protocol.Speak(text, text, SENTENCE_RATE_WPM, 1.0, voice, 50, voice_only=True))
@@ -330,7 +339,10 @@ def judge_server_voices(voices: dict[str, Any]) -> list[Finding]:
 
 
 def judge_trial(used: str, trial: VoiceTrial, server_voices: dict[str, Any] | None) -> Finding:
-    """Return the finding about trying the neural voice in use. The other arguments are those of `check_neural`."""
+    """Return the finding about trying the neural voice in use.
+
+    The other arguments are those of `check_neural`.
+    """
     broken = failure if server_voices is None else warning
     words = f"{used} is in use: "
     if trial.speed is None:

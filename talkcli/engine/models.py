@@ -132,7 +132,9 @@ def read_description(path: str) -> VoiceDescription:
 
 
 def open_checked(path: str, missing: str = "restore it", model: str = "") -> Any:
-    """Open a binary file for reading. Raise VoiceFileError if another user could change it.
+    """Open a binary file for reading.
+
+    Raise VoiceFileError if another user could change it.
 
     Args:
         path: The path of the file.
@@ -246,7 +248,10 @@ def _is_private_group(user: int, group: int) -> bool:
 
 
 def _writable_error(*paths: str) -> VoiceFileError:
-    """Return the error for files that other users can write to. It includes a command that fixes all of them."""
+    """Return the error for files that other users can write to.
+
+    It includes a command that fixes all of them.
+    """
     import shlex  # imported here because it is rarely needed
 
     names = f"{', '.join(paths[:-1])} and {paths[-1]}" if len(paths) > 1 else paths[0]
@@ -331,7 +336,10 @@ def _shorten(value: object) -> str:
 
 
 def _checked_integer(value: object) -> int:
-    """Return the value if it is an integer from 0 to 2,147,483,647. Otherwise raise ValueError."""
+    """Return the value if it is an integer from 0 to 2,147,483,647.
+
+    Otherwise raise ValueError.
+    """
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 31:
         raise ValueError(f"{value!r} is not a valid integer")
     return value

@@ -177,7 +177,10 @@ def player_commands(player: str | None, device: str | None, rate: int, last: str
 
 
 def _parse_custom_command(player: str, device: str | None, rate: int) -> PlayerCommand:
-    """Return a custom player command with its placeholders filled in. Raise PlayerMissing if it can't be run."""
+    """Return a custom player command with its placeholders filled in.
+
+    Raise PlayerMissing if it can't be run.
+    """
     import shlex
 
     try:
@@ -235,7 +238,10 @@ def _config_home(env: Mapping[str, str]) -> str:
 
 
 def _has_default_server(path: str) -> bool:
-    """Return whether PulseAudio's client configuration names a server. Debian's default file doesn't."""
+    """Return whether PulseAudio's client configuration names a server.
+
+    Debian's default file doesn't.
+    """
     with contextlib.suppress(OSError), open(path, "rb") as file:
         return any(line.lstrip().startswith(b"default-server") for line in file)
     return False

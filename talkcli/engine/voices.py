@@ -216,7 +216,9 @@ def speaker_number(speaker: str, numbers: Mapping[str, int], count: int) -> int:
 
 
 def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], foreign_driver: str | None = None) -> str:
-    """Return the error message for an unknown voice. It suggests similar voices, or says what to do next.
+    """Return the error message for an unknown voice.
+
+    It suggests similar voices, or says what to do next.
 
     Args:
         wanted: The name that the user typed.
@@ -269,7 +271,10 @@ def _suggestions(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
 
 
 def _split_variants(voices: Sequence[Voice]) -> tuple[list[Voice], list[Voice]]:
-    """Return two lists: the voices of libespeak-ng or another driver, and the variants. Omit neural voices."""
+    """Return two lists: the voices of libespeak-ng or another driver, and the variants.
+
+    Omit neural voices.
+    """
     plain = [each for each in voices if not each.id.startswith((VARIANT_PREFIX, NEURAL_PREFIX))]
     return plain, [each for each in voices if each.id.startswith(VARIANT_PREFIX)]
 
@@ -300,7 +305,9 @@ def _names_of(voice: Voice) -> tuple[str, str, str, str]:
 
 
 def _find_variant(suffix: str, variants: list[Voice]) -> Voice | None:
-    """Find a variant by the part of a voice's name after the "+". Return None if there is none.
+    """Find a variant by the part of a voice's name after the "+".
+
+    Return None if there is none.
 
     As in libespeak-ng, the numbers 1 to 9 select male variants, and the numbers from 11 on select female variants.
     """

@@ -63,7 +63,9 @@ class Fleet:
         self._name = name
 
     def robots(self) -> list[Presence]:
-        """Return all robots of the fleet, sorted by name. This includes robots that are offline.
+        """Return all robots of the fleet, sorted by name.
+
+        This includes robots that are offline.
 
         Raises:
             ServerUnavailable: The broker can't be reached.
@@ -108,25 +110,35 @@ class Fleet:
         before: str | None = None,
         key: str | None = None,
     ) -> FleetRequest:
-        """Cancel goals on each robot, by default all of them. Return the request, which yields the outcomes.
+        """Cancel goals on each robot, by default all of them.
+
+        Return the request, which yields the outcomes.
 
         The other arguments are those of `Client.cancel`. The outcome of a robot arrives when the robot is silent.
         """
         return self._send_request(to, Cancel(None if ids is None else tuple(ids), current, before, key))
 
     def wait(self, to: str, ids: Iterable[str] | None = None) -> FleetRequest:
-        """Wait for goals on each robot, by default all current ones. Return the request, which yields the outcomes."""
+        """Wait for goals on each robot, by default all current ones.
+
+        Return the request, which yields the outcomes.
+        """
         return self._send_request(to, Wait(None if ids is None else tuple(ids)))
 
     def status(self, to: str) -> FleetRequest:
-        """Request the status of each robot's server. Return the request, which yields the outcomes.
+        """Request the status of each robot's server.
+
+        Return the request, which yields the outcomes.
 
         Each outcome contains the status as `said["status"]`.
         """
         return self._send_request(to, Status())
 
     def pause(self, to: str) -> FleetRequest:
-        """Pause speech on each robot until `resume` is called. Return the request, which yields the outcomes."""
+        """Pause speech on each robot until `resume` is called.
+
+        Return the request, which yields the outcomes.
+        """
         return self._send_request(to, Pause())
 
     def resume(self, to: str) -> FleetRequest:
@@ -134,7 +146,9 @@ class Fleet:
         return self._send_request(to, Resume())
 
     def set(self, to: str, **settings: Any) -> FleetRequest:
-        """Change the settings of each robot's server. Return the request, which yields the outcomes.
+        """Change the settings of each robot's server.
+
+        Return the request, which yields the outcomes.
 
         If a robot's bridge doesn't allow this, its outcome is REFUSED. The arguments are those of `Client.set`.
         """

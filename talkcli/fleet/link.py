@@ -65,7 +65,10 @@ _LINGER_DISCARD, _LINGER_DELIVER = struct.pack("ii", 1, 0), struct.pack("ii", 0,
 
 
 def boottime() -> float:
-    """Return the seconds since the machine booted. On Linux, this includes time spent suspended."""
+    """Return the seconds since the machine booted.
+
+    On Linux, this includes time spent suspended.
+    """
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
@@ -215,7 +218,10 @@ class Link:
                 self._paho.loop_write()
 
     def tick(self) -> None:
-        """Send keepalive messages, and check that the broker answers them. Call this every `TICK_EVERY_S` seconds."""
+        """Send keepalive messages, and check that the broker answers them.
+
+        Call this every `TICK_EVERY_S` seconds.
+        """
         with self._lock:
             if self.ended is None:
                 self._paho.loop_misc()
@@ -345,7 +351,10 @@ class Link:
 
 @lru_cache(maxsize=32)
 def _properties(expiry: float | None, response: str | None, correlation: bytes | None) -> Properties:
-    """Return the MQTT properties for a message. They are cached, because creating them is slow."""
+    """Return the MQTT properties for a message.
+
+    They are cached, because creating them is slow.
+    """
     properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
     if expiry is not None:
         properties.MessageExpiryInterval = max(1, math.ceil(min(expiry, 2**31)))
@@ -380,7 +389,10 @@ class LinkOpener:
                 self.link.close()
 
     def _open(self) -> None:
-        """Open the link and store any error. Then call `on_done`, or close the link if `cancel` was called."""
+        """Open the link and store any error.
+
+        Then call `on_done`, or close the link if `cancel` was called.
+        """
         try:
             self.link.open()
         except TalkError as error:

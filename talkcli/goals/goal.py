@@ -95,7 +95,9 @@ class Output:
 
 @frozen
 class Goal:
-    """An immutable copy of a goal. Its JSON always contains all keys, with null for unknown values.
+    """An immutable copy of a goal.
+
+    Its JSON always contains all keys, with null for unknown values.
 
     Times are seconds since 1970 UTC. `duration` is the length of the audio in seconds.
     """
@@ -160,7 +162,10 @@ class Goal:
 
     @classmethod
     def from_json(cls, value: object) -> Goal:
-        """Read a goal from its JSON object. Raises Unreadable if the id or the state is missing or invalid."""
+        """Read a goal from its JSON object.
+
+        Raises Unreadable if the id or the state is missing or invalid.
+        """
         found = read_fields(cls, value)
         if not str(found.get("id", "\n")).isprintable() or "state" not in found:  # ids are printed unescaped
             raise Unreadable("received a goal with an invalid id or an unknown state")
@@ -168,7 +173,10 @@ class Goal:
 
 
 def read_fields(cls: type, message: object) -> dict[str, Any]:
-    """Read the fields of a class from a JSON object, and return a dict. Values of the wrong type are skipped."""
+    """Read the fields of a class from a JSON object, and return a dict.
+
+    Values of the wrong type are skipped.
+    """
     found = {}
     values = message if isinstance(message, dict) else {}
     for name, annotation in cls.__annotations__.items():

@@ -41,7 +41,10 @@ MAX_EARLY_CANCELS = 1_000
 
 
 class History:
-    """Records of ended goals, oldest first. The number of goals and the size of their texts are limited."""
+    """Records of ended goals, oldest first.
+
+    The number of goals and the size of their texts are limited.
+    """
 
     def __init__(self) -> None:
         self._all: dict[str, Record] = {}
@@ -86,7 +89,10 @@ class SpeechTimes:
         self._starts: OrderedDict[str | bytes, tuple[float, str]] = OrderedDict()
 
     def add(self, record: Record) -> None:
-        """Record when a goal started, under its key and its text. The goal must have been heard, at least in part."""
+        """Record when a goal started, under its key and its text.
+
+        The goal must have been heard, at least in part.
+        """
         for each in (record.say.key, _digest(record.say.text)):
             if each is not None:
                 _set_newest(self._starts, each, (record.began_at, record.id), MAX_SPEECH_TIMES)
@@ -118,7 +124,10 @@ class EarlyCancels:
 
 
 def _set_newest(entries: OrderedDict[_Key, _Value], key: _Key, value: _Value, limit: int) -> None:
-    """Add or replace an entry as the newest one. If there are too many entries, drop the oldest."""
+    """Add or replace an entry as the newest one.
+
+    If there are too many entries, drop the oldest.
+    """
     entries[key] = value
     entries.move_to_end(key)
     if len(entries) > limit:
@@ -126,5 +135,8 @@ def _set_newest(entries: OrderedDict[_Key, _Value], key: _Key, value: _Value, li
 
 
 def _digest(text: str) -> bytes:
-    """Return a hash of a text. Keeping ten thousand texts instead could use 400 MB of memory."""
+    """Return a hash of a text.
+
+    Keeping ten thousand texts instead could use 400 MB of memory.
+    """
     return hashlib.blake2b(text.encode(errors="surrogatepass"), digest_size=16).digest()

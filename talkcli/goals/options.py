@@ -83,7 +83,10 @@ class Kind:
 
 
 def is_clients_id(goal_id: str) -> bool:
-    """Return whether a client may choose this id. Ids that look like the server's own are reserved."""
+    """Return whether a client may choose this id.
+
+    Ids that look like the server's own are reserved.
+    """
     if not (0 < len(goal_id) <= MAX_ID_CHARS and _ID_CHARACTERS.issuperset(goal_id)) or goal_id[0] == "-":
         return False
     boot, dash, number = goal_id.partition("-")
@@ -524,7 +527,10 @@ class Say:
 
 @frozen
 class Set:
-    """A request to change the server's settings for goals that haven't started. None leaves a setting unchanged."""
+    """A request to change the server's settings for goals that haven't started.
+
+    None leaves a setting unchanged.
+    """
 
     kind: ClassVar[str] = "set"
     meaning: ClassVar[str] = "Change the server's settings for goals that haven't started. Omit a setting to keep it"
@@ -598,7 +604,10 @@ class Cancel:
 
 
 def require_fields(cls: type, options: Iterable[str]) -> None:
-    """Raise TypeError if a class has no field for one of the options. Called when a module is imported."""
+    """Raise TypeError if a class has no field for one of the options.
+
+    Called when a module is imported.
+    """
     for name in options:
         if name not in cls.__annotations__:
             raise TypeError(f"{cls.__name__} has no field for the option {name!r}")
@@ -650,7 +659,10 @@ def bad_text(text: str, max_chars: int | None = MAX_TEXT_CHARS) -> Refusal | Non
 
 
 def engine_options(say: Say, settings: Set) -> dict[str, Any]:
-    """Return the options that the engine needs for a goal, by name. Omitted options come from the settings."""
+    """Return the options that the engine needs for a goal, by name.
+
+    Omitted options come from the settings.
+    """
     found = {}
     for name in ENGINE_OPTIONS:
         own = getattr(say, name)

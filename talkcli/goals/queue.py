@@ -51,11 +51,17 @@ class Queue:
         return self._goals[0][2] if self._goals else None
 
     def with_key(self, key: str | None) -> Record | None:
-        """Return the pending goal with this key, if any. Two pending goals never have the same key."""
+        """Return the pending goal with this key, if any.
+
+        Two pending goals never have the same key.
+        """
         return None if key is None else self._by_key.get(key)
 
     def with_text(self, text: str) -> Record | None:
-        """Return the first goal with this text, or None. This is slow, because it checks every goal."""
+        """Return the first goal with this text, or None.
+
+        This is slow, because it checks every goal.
+        """
         return next((each for each in self if each.say.text == text), None)
 
     def goals_up_to(self, priority: int) -> list[Record]:
@@ -67,7 +73,10 @@ class Queue:
         return list(map(_record_of, self._preempting[bisect_left(self._preempting, (-priority,)) :]))
 
     def displaceable_goal(self) -> Record | None:
-        """Return the newest goal of the lowest priority, or None. It is removed first if the queue is full."""
+        """Return the newest goal of the lowest priority, or None.
+
+        It is removed first if the queue is full.
+        """
         return self._displaceable[-1][2] if self._displaceable else None
 
     def add(self, record: Record, replaced: Record | None = None) -> None:

@@ -148,7 +148,10 @@ class Scheduler:
         return self._by_id.get(goal_id) or self.history.find(goal_id)
 
     def has_room(self, say: Say) -> bool:
-        """Return whether the queue has room for a goal, or can make room. A known id needs no room."""
+        """Return whether the queue has room for a goal, or can make room.
+
+        A known id needs no room.
+        """
         attaches = say.id is not None and self.find(say.id) is not None
         return attaches or self._find_room(say) is not None
 
@@ -178,7 +181,9 @@ class Scheduler:
         canceled: By | None = None,
         waited_s: float = 0.0,
     ) -> tuple[Record, list[Effect]]:
-        """Reject a goal or add it to the queue. Return its record, and the effects to carry out.
+        """Reject a goal or add it to the queue.
+
+        Return its record, and the effects to carry out.
 
         Args:
             say: the goal.
@@ -227,7 +232,9 @@ class Scheduler:
     def cancel(
         self, selection: Cancel, sender: Sender | None, now: Now, waiting: Collection[str | None] = ()
     ) -> Cancellation:
-        """Cancel the selected goals, and remember cancels for unknown ids. The result contains the effects.
+        """Cancel the selected goals, and remember cancels for unknown ids.
+
+        The result contains the effects.
 
         Args:
             selection: the goals to cancel.
@@ -251,7 +258,9 @@ class Scheduler:
         return result
 
     def change_settings(self, changes: dict[str, object], now: Now) -> list[Effect]:
-        """Change the settings for goals that have not started, and request a new voice. Return the effects.
+        """Change the settings for goals that have not started, and request a new voice.
+
+        Return the effects.
 
         A new voice that failed to load earlier is loaded again.
         """
@@ -284,7 +293,10 @@ class Scheduler:
         return [EngineOrder(self.active, Order.RESUME)]
 
     def shutdown(self, now: Now) -> list[Effect]:
-        """End all pending goals, and reject new ones. The returned effects also stop the active goal."""
+        """End all pending goals, and reject new ones.
+
+        The returned effects also stop the active goal.
+        """
         self.closing = True
         effects: list[Effect] = []
         for record in list(self.pending):
@@ -296,7 +308,10 @@ class Scheduler:
     # -- reports from the engine
 
     def engine_lost(self, now: Now) -> list[Effect]:
-        """Record that the engine process has exited, so that no goal starts. Return warnings about voices."""
+        """Record that the engine process has exited, so that no goal starts.
+
+        Return warnings about voices.
+        """
         self.has_engine = self._loads_voices = False
         return [*self.voices.engine_lost(now.monotonic)]
 
@@ -308,7 +323,10 @@ class Scheduler:
         return self._start_next(now) + self._order_next_voice(now)
 
     def engine_unavailable(self, now: Now) -> list[Effect]:
-        """Record that no engine can be started, so that goals fail at once. Return the effects."""
+        """Record that no engine can be started, so that goals fail at once.
+
+        Return the effects.
+        """
         self.has_engine, self._loads_voices = True, False
         return self._start_next(now)
 
@@ -323,7 +341,9 @@ class Scheduler:
         return effects + self.failed(record.id, Reason.ENGINE_FAILED, message, None, now) if record else effects
 
     def word_heard(self, goal_id: str, end: int) -> None:
-        """Record how far the active goal has been heard. Raises IllegalTransition if it has another id.
+        """Record how far the active goal has been heard.
+
+        Raises IllegalTransition if it has another id.
 
         Args:
             goal_id: the id of the goal.
@@ -333,7 +353,10 @@ class Scheduler:
         record.spoken_end = max(record.spoken_end, end)
 
     def voice_chosen(self, goal_id: str, voice: str, now: Now) -> list[Effect]:
-        """Record which voice speaks the active goal. Return the order to load the next voice, if any."""
+        """Record which voice speaks the active goal.
+
+        Return the order to load the next voice, if any.
+        """
         self._require_active(goal_id).voice = voice
         return self._order_next_voice(now)
 
@@ -344,7 +367,9 @@ class Scheduler:
     def completed(
         self, goal_id: str, duration: float | None, now: Now, gaps: int = 0, gap_seconds: float = 0
     ) -> list[Effect]:
-        """End the active goal as SUCCEEDED, because it was played to the end. Return the effects.
+        """End the active goal as SUCCEEDED, because it was played to the end.
+
+        Return the effects.
 
         Args:
             goal_id: the id of the goal.
@@ -366,7 +391,9 @@ class Scheduler:
         return self._end(record, State.SUCCEEDED, None, words, None, now)
 
     def failed(self, goal_id: str, reason: Reason, message: str, duration: float | None, now: Now) -> list[Effect]:
-        """End the active goal as ABORTED, or as PREEMPTED if it was being stopped. Return the effects.
+        """End the active goal as ABORTED, or as PREEMPTED if it was being stopped.
+
+        Return the effects.
 
         If the goal was being stopped, the failure has silenced it, so it ends PREEMPTED. It ends ABORTED only with the
         reason `not_silent`.
@@ -378,12 +405,17 @@ class Scheduler:
         return self._end(record, State.ABORTED, reason, f"speech failed: {message}", record.by, now)
 
     def stopped(self, goal_id: str, now: Now) -> list[Effect]:
-        """End the active goal as PREEMPTED, because it was stopped and is silent. Return the effects."""
+        """End the active goal as PREEMPTED, because it was stopped and is silent.
+
+        Return the effects.
+        """
         record = self._require_active(goal_id)
         return self._end(record, State.PREEMPTED, record.reason, "Talk preempted", record.by, now)
 
     def voice_load_ended(self, voice: str, error: str | None, now: Now, *, has_libraries: bool) -> list[Effect]:
-        """Record that loading a voice succeeded or failed. Return the effects, such as starting a waiting goal.
+        """Record that loading a voice succeeded or failed.
+
+        Return the effects, such as starting a waiting goal.
 
         Args:
             voice: the id of the voice.
@@ -396,7 +428,9 @@ class Scheduler:
         return self._order_voice_drops() + self.tick(now)
 
     def voices_measured(self, voice: str, memory_bytes: int, now: Now) -> list[Effect]:
-        """Record how much memory all neural voices use. Return the orders to drop or load voices.
+        """Record how much memory all neural voices use.
+
+        Return the orders to drop or load voices.
 
         Args:
             voice: the voice that was just loaded or has just spoken, or "" if a voice was dropped.
@@ -407,7 +441,10 @@ class Scheduler:
         return self._order_voice_drops() + self._order_next_voice(now)
 
     def voice_unloaded(self, voice: str, now: Now) -> list[Effect]:
-        """Record that the engine dropped a voice on its own. Return the order to load the next voice, if any."""
+        """Record that the engine dropped a voice on its own.
+
+        Return the order to load the next voice, if any.
+        """
         self.voices.unloaded(voice, self._needed_voices())
         return self._order_next_voice(now)
 
@@ -462,7 +499,9 @@ class Scheduler:
         return sorted(unique, key=lambda each: (each is self.active, each.number))
 
     def _find_refusal(self, say: Say, refusal: Refusal | None, same_id: Record | None) -> Refusal | None:
-        """Return the reason why a goal must be rejected, or None. The state of the queue doesn't matter.
+        """Return the reason why a goal must be rejected, or None.
+
+        The state of the queue doesn't matter.
 
         Args:
             say: the goal.
@@ -478,7 +517,9 @@ class Scheduler:
         return options.bad_text(say.text, self.max_text) or refusal
 
     def _throttle(self, say: Say, record: Record, now: Now) -> Refusal | None:
-        """Return the reason if a goal repeats another one too soon, otherwise None. May set `record.by`.
+        """Return the reason if a goal repeats another one too soon, otherwise None.
+
+        May set `record.by`.
 
         If the goal is rejected, `record.by` is set to the other goal.
         """
@@ -522,7 +563,10 @@ class Scheduler:
         return [(last, Reason.DISPLACED)] if last and last.say.priority <= limit else None
 
     def _enqueue(self, record: Record, recalled: list[tuple[Record, Reason]], now: Now) -> list[Effect]:
-        """Add a goal to the queue, and recall the given goals. The returned effects stop a preempted active goal."""
+        """Add a goal to the queue, and recall the given goals.
+
+        The returned effects stop a preempted active goal.
+        """
         by = By(goal=record.id)
         effects: list[Effect] = []
         replaced = None
@@ -552,7 +596,9 @@ class Scheduler:
         return list(filter(options.is_neural, dict.fromkeys(voices)))
 
     def _order_next_voice(self, now: Now) -> list[Effect]:
-        """Choose the next voice to load, and mark it as loading. Return a list with the order, if any.
+        """Choose the next voice to load, and mark it as loading.
+
+        Return a list with the order, if any.
 
         The first voice is not loaded while a goal is active. Loading it imports libraries, which blocks the engine
         process for a tenth of a second.
@@ -608,14 +654,19 @@ class Scheduler:
         return self.voices.start_time(record, self.settings.voice) if self._loads_voices else 0.0
 
     def _start_next(self, now: Now) -> list[Effect]:
-        """Make the next goal ACTIVE if possible. Return the effects, including the order to speak it."""
+        """Make the next goal ACTIVE if possible.
+
+        Return the effects, including the order to speak it.
+        """
         if not self.has_engine:
             return []
         record, effects = self._activate_next(now)
         return [*effects, EngineOrder(record, Order.START)] if record else effects
 
     def _activate_next(self, now: Now) -> tuple[Record | None, list[Effect]]:
-        """Make the next goal ACTIVE if possible. Return it, and the effects without the order to speak it.
+        """Make the next goal ACTIVE if possible.
+
+        Return it, and the effects without the order to speak it.
 
         Return None instead of a goal if no goal can start now.
         """
@@ -662,7 +713,10 @@ class Scheduler:
     def _end(
         self, record: Record, state: State, reason: Reason | None, message: str, by: By | None, now: Now
     ) -> list[Effect]:
-        """Set a goal's final state, and move it to the history. Return the effects, such as starting the next goal."""
+        """Set a goal's final state, and move it to the history.
+
+        Return the effects, such as starting the next goal.
+        """
         record.change_state(state)
         record.reason, record.message, record.by = reason, message, by
         record.ended_at, record.paused = now.wall, False

@@ -116,7 +116,10 @@ class VoiceScheduler:
     # -- requests from goals
 
     def request(self, voice: str, now: float) -> None:
-        """Record that a goal asks for a voice, and plan to load it. A failed voice is retried after a delay."""
+        """Record that a goal asks for a voice, and plan to load it.
+
+        A failed voice is retried after a delay.
+        """
         found = self._voices.pop(voice, None) or self._new_voice(voice)
         self._voices[voice] = found
         if found.state is VoiceState.FAILED and voice != self._loading and now >= found.retry_at:
@@ -194,7 +197,9 @@ class VoiceScheduler:
         return None
 
     def drop_excess(self, first: str, needed: Sequence[str]) -> list[VoiceDropOrder | VoiceWarning]:
-        """Record which voices to drop to meet the memory limit. Return the orders to drop them, and any warnings.
+        """Record which voices to drop to meet the memory limit.
+
+        Return the orders to drop them, and any warnings.
 
         This is necessary if the voices use more memory than was estimated.
 
@@ -245,7 +250,10 @@ class VoiceScheduler:
             self._measured_bytes[voice] = found.size_bytes
 
     def unloaded(self, voice: str, needed: Collection[str]) -> None:
-        """Record that the engine has dropped a voice. If a goal needs it, plan to load it again."""
+        """Record that the engine has dropped a voice.
+
+        If a goal needs it, plan to load it again.
+        """
         found = self._voices.pop(voice, None)
         if found and found.state is VoiceState.LOADED:
             self._used_bytes = max(0, self._used_bytes - found.size_bytes)  # estimated until the next measurement

@@ -47,7 +47,10 @@ class ServerStatus:
 
     @classmethod
     def from_json(cls, message: JsonObject) -> ServerStatus:
-        """Read a status from its JSON object. Raises Unreadable if one of the goals is malformed."""
+        """Read a status from its JSON object.
+
+        Raises Unreadable if one of the goals is malformed.
+        """
         server, pending, recent = message.get("server"), message.get("pending"), message.get("recent")
         return cls(
             server if isinstance(server, dict) else {},
@@ -154,7 +157,10 @@ class Result:
 
 @frozen
 class Snapshot:
-    """Event sent when a client starts to watch. It has the state of the server and of all goals."""
+    """Event sent when a client starts to watch.
+
+    It has the state of the server and of all goals.
+    """
 
     status: ServerStatus
 
@@ -193,18 +199,27 @@ def from_json(message: JsonObject) -> Event | None:
 
 
 def _event_json(kind: str, event: StateChanged | WordHeard | PausedChanged) -> JsonObject:
-    """Return an event's fields for its JSON object, without its goal. The caller converts enums and objects."""
+    """Return an event's fields for its JSON object, without its goal.
+
+    The caller converts enums and objects.
+    """
     own = {name: value for name, value in fields(event).items() if name not in {"at", "n", "goal"}}
     return {"event": kind, **own, "n": event.n, "at": event.at}
 
 
 def goals(items: list[JsonObject], name: str) -> Iterator[Goal]:
-    """Yield the goals in the field `name` of list items. Raises Unreadable if a goal is malformed."""
+    """Yield the goals in the field `name` of list items.
+
+    Raises Unreadable if a goal is malformed.
+    """
     return (Goal.from_json(each[name]) for each in items if name in each)
 
 
 def goal_in(reply: JsonObject, name: str = "goal") -> Goal | None:
-    """Read a goal from a reply, or return None if the field is null. Raises Unreadable if the goal is malformed."""
+    """Read a goal from a reply, or return None if the field is null.
+
+    Raises Unreadable if the goal is malformed.
+    """
     return None if reply.get(name) is None else Goal.from_json(reply[name])
 
 
@@ -240,7 +255,10 @@ def check_greeting(message: JsonObject) -> None:
 
 
 def item(seq: int | None, **fields: object) -> JsonObject:
-    """Return the message for one item of a list, with these fields. The items are sent before the reply."""
+    """Return the message for one item of a list, with these fields.
+
+    The items are sent before the reply.
+    """
     return fields if seq is None else {"seq": seq, **fields}
 
 
@@ -255,7 +273,10 @@ def failure(seq: int | None, code: str, message: str) -> JsonObject:
 
 
 def take_seq(message: JsonObject) -> int | None:
-    """Remove and return a request's `seq` number, if it has one. Raises BadRequest if it isn't an integer."""
+    """Remove and return a request's `seq` number, if it has one.
+
+    Raises BadRequest if it isn't an integer.
+    """
     seq = message.pop("seq", None)
     if seq is not None and (isinstance(seq, bool) or not isinstance(seq, int)):
         raise BadRequest("'seq' must be an integer", "bad_field")

@@ -37,7 +37,10 @@ class TruncatedLine(bytes):
 
 
 class LineSplitter:
-    """Splits a stream of bytes into lines. It keeps at most the first `max_bytes` bytes of a line."""
+    """Splits a stream of bytes into lines.
+
+    It keeps at most the first `max_bytes` bytes of a line.
+    """
 
     __slots__ = ("_max_bytes", "_rest", "size")
 
@@ -96,7 +99,10 @@ def request_line(message: JsonObject) -> bytes:
 
 
 def _encode_simple(value: object) -> str:
-    """Encode a simple value as JSON. Raises TypeError if the value needs the `json` module."""
+    """Encode a simple value as JSON.
+
+    Raises TypeError if the value needs the `json` module.
+    """
     if isinstance(value, str):
         if value.isprintable() and '"' not in value and "\\" not in value:
             return f'"{value}"'
@@ -115,7 +121,9 @@ def _encode_simple(value: object) -> str:
 
 
 def encode(message: JsonObject) -> bytes:
-    """Encode an object as a line of JSON. Raises ValueError or TypeError if that is impossible.
+    """Encode an object as a line of JSON.
+
+    Raises ValueError or TypeError if that is impossible.
 
     Text is written as UTF-8. Only lone surrogates, which UTF-8 can't hold, are escaped.
     """
@@ -127,7 +135,10 @@ def encode(message: JsonObject) -> bytes:
 
 
 def decode(line: bytes) -> JsonObject:
-    """Decode the JSON object in a line. Raises BadRequest if the line is malformed or too long."""
+    """Decode the JSON object in a line.
+
+    Raises BadRequest if the line is malformed or too long.
+    """
     from talkcli.errors import BadRequest, LineTooLong
 
     if isinstance(line, TruncatedLine):
@@ -151,7 +162,10 @@ _json_functions: dict[str, Callable[[Any], Any]] = {}
 
 
 def _json_function(name: str) -> Callable[[Any], Any]:
-    """Return the JSON function called `decode`, `encode` or `escape`. The first call creates all three."""
+    """Return the JSON function called `decode`, `encode` or `escape`.
+
+    The first call creates all three.
+    """
     if not _json_functions:
         import json
 
@@ -167,7 +181,10 @@ def _json_function(name: str) -> Callable[[Any], Any]:
 
 
 def _create_object(pairs: list[tuple[str, object]]) -> JsonObject:
-    """Return an object with these keys and values. Raises ValueError if a key appears twice."""
+    """Return an object with these keys and values.
+
+    Raises ValueError if a key appears twice.
+    """
     fields = dict(pairs)
     if len(fields) != len(pairs):
         raise ValueError("a key appears twice")
@@ -180,7 +197,10 @@ def _refuse_constant(name: str) -> object:
 
 
 def _parse_integer(digits: str) -> int:
-    """Convert a string of digits to an integer. Raises ValueError if the string is too long."""
+    """Convert a string of digits to an integer.
+
+    Raises ValueError if the string is too long.
+    """
     if len(digits) > MAX_DIGITS:
         raise ValueError(f"an integer has {len(digits):,} digits (at most {MAX_DIGITS})")
     return int(digits)

@@ -65,7 +65,10 @@ class Hello:
 
 @frozen
 class Wait:
-    """A request for the results of the named goals, or of all unfinished goals. Any client may have sent them."""
+    """A request for the results of the named goals, or of all unfinished goals.
+
+    Any client may have sent them.
+    """
 
     kind: ClassVar[str] = "wait"
     meaning: ClassVar[str] = "Send the results of these goals, whoever sent them"

@@ -95,7 +95,10 @@ class PendingRequest:
         self._steps: Steps
 
     def start(self, steps: Steps) -> None:
-        """Run the coroutine until it waits or ends. It must answer the request and must not raise."""
+        """Run the coroutine until it waits or ends.
+
+        It must answer the request and must not raise.
+        """
         self._steps = steps
         self._step(None)
 
@@ -174,7 +177,10 @@ def resume_all(waiting_list: WaitingList) -> None:
 
 @coroutine
 def _wait_in(waiting_list: WaitingList) -> Generator[WaitingList, bool, bool]:
-    """Suspend a request's coroutine until it is resumed from this list. Return whether that was in time."""
+    """Suspend a request's coroutine until it is resumed from this list.
+
+    Return whether that was in time.
+    """
     return (yield waiting_list)
 
 
@@ -263,7 +269,10 @@ class ClientConnection(asyncio.Protocol):
     # -- called by the handler
 
     def send(self, message: JsonObject | bytes) -> None:
-        """Send a reply or an encoded line after all unfinished lists. If too many lines wait, disconnect the client."""
+        """Send a reply or an encoded line after all unfinished lists.
+
+        If too many lines wait, disconnect the client.
+        """
         if self._half_closed:  # if this is the last reply, close the connection soon
             self._schedule_work()
         line = message if isinstance(message, bytes) else encode(message)
@@ -276,12 +285,18 @@ class ClientConnection(asyncio.Protocol):
             self.stream.abort()
 
     def send_list(self, messages: Iterator[JsonObject]) -> None:
-        """Send a list of messages as fast as the client reads them. Later messages follow the list."""
+        """Send a list of messages as fast as the client reads them.
+
+        Later messages follow the list.
+        """
         self._outbox.append(messages)
         self._schedule_work()
 
     def publish(self, event: bytes, *, feedback: bool = False) -> None:
-        """Send an encoded event. If the client reads too slowly, only the newest feedback is kept."""
+        """Send an encoded event.
+
+        If the client reads too slowly, only the newest feedback is kept.
+        """
         if feedback and self.stream.congested:
             self._held_feedback = event
         else:
@@ -310,7 +325,9 @@ class ClientConnection(asyncio.Protocol):
         return self._loop.call_later(seconds, self.close_with, failure(None, "too_slow", message))
 
     def _update_reading(self) -> None:
-        """Start or stop reading from the client. Also start or cancel the time limit for an incomplete line.
+        """Start or stop reading from the client.
+
+        Also start or cancel the time limit for an incomplete line.
 
         The server reads only while the client reads its replies and has few unprocessed lines.
         """
@@ -394,7 +411,10 @@ class ClientConnection(asyncio.Protocol):
         return True
 
     def _process_line(self, line: bytes) -> None:
-        """Pass a line's request to the handler, or reply with an error. An urgent request admits the client."""
+        """Pass a line's request to the handler, or reply with an error.
+
+        An urgent request admits the client.
+        """
         seq = None
         try:
             message = decode(line)

@@ -71,7 +71,9 @@ class Listener:
         return _identity(self.path) == self._identity and _is_lock_of(self.path, self._lock)
 
     def bind_again(self) -> socket.socket | None:
-        """Recreate a missing socket file or lock file. Return the old socket if the caller must close it.
+        """Recreate a missing socket file or lock file.
+
+        Return the old socket if the caller must close it.
 
         Returns:
             The old socket, which the caller must close, or None if it is still in use.
@@ -92,7 +94,10 @@ class Listener:
         return former
 
     def close(self) -> None:
-        """Close the socket and release the lock. Remove the socket file unless it was replaced."""
+        """Close the socket and release the lock.
+
+        Remove the socket file unless it was replaced.
+        """
         if _identity(self.path) == self._identity:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(self.path)
@@ -101,7 +106,10 @@ class Listener:
 
 
 class InheritedListener:
-    """A listening socket passed by systemd (LISTEN_FDS). Only systemd removes the socket file."""
+    """A listening socket passed by systemd (LISTEN_FDS).
+
+    Only systemd removes the socket file.
+    """
 
     passed = True
 
@@ -132,7 +140,9 @@ class InheritedListener:
 
 
 def listen(path: str | None, mode: int) -> Listener | InheritedListener:
-    """Return the listening socket passed by systemd if it has this path. Otherwise, bind a new socket.
+    """Return the listening socket passed by systemd if it has this path.
+
+    Otherwise, bind a new socket.
 
     Args:
         path: the path of the socket file, or None for any passed socket, or else the usual place.
@@ -268,7 +278,10 @@ def _refuse_other_file(path: str) -> None:
 
 
 def _bind(path: str, mode: int) -> socket.socket:
-    """Remove an old socket file, and return a new socket that listens there. The caller must hold the lock."""
+    """Remove an old socket file, and return a new socket that listens there.
+
+    The caller must hold the lock.
+    """
     _refuse_other_file(path)
     with _raise_in_use(f"can't remove the old socket {path}"), contextlib.suppress(FileNotFoundError):
         os.unlink(path)
@@ -315,7 +328,10 @@ def _is_lock_of(path: str, fd: int) -> bool:
 
 
 def _open_lock(path: str) -> int:
-    """Open or create a lock file, and return its descriptor. Raises AddressInUse if it isn't a plain file."""
+    """Open or create a lock file, and return its descriptor.
+
+    Raises AddressInUse if it isn't a plain file.
+    """
     flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     while True:
         with _raise_in_use(f"can't open the lock file {path}"):

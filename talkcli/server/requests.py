@@ -134,7 +134,10 @@ class Requests:
             each.resume()
 
     def _reserve_memory(self, pending: PendingRequest) -> bool:
-        """Count a waiting request's memory and return True. If too many wait, set its refusal and return False."""
+        """Count a waiting request's memory and return True.
+
+        If too many wait, set its refusal and return False.
+        """
         if pending.kept_bytes:
             return True  # the request has waited before
         size = REQUEST_BYTES + sum(map(_memory_of, fields(pending.request).values()))
@@ -193,7 +196,10 @@ class Requests:
         return [each.resume for each in new]
 
     async def _await_room(self, pending: PendingRequest, say: Say) -> float:
-        """Wait until the queue has room or the goal has expired. Return the waiting time in seconds."""
+        """Wait until the queue has room or the goal has expired.
+
+        Return the waiting time in seconds.
+        """
         ttl = (self._scheduler.settings.ttl if say.ttl is None else say.ttl) or None
         began = self._speech.advance_time().monotonic
         self._speech.subscribers.schedule_keep_alive()
@@ -204,7 +210,10 @@ class Requests:
     # -- coroutines, named after the requests that they handle
 
     async def _say(self, pending: PendingRequest, say: Say) -> None:
-        """Submit a goal and reply. If the queue is full, a `patient` goal first waits for room."""
+        """Submit a goal and reply.
+
+        If the queue is full, a `patient` goal first waits for room.
+        """
         speech, scheduler, connection = self._speech, self._scheduler, pending.connection
         waited = 0.0
         if pending.canceled_by is None:
@@ -238,7 +247,9 @@ class Requests:
         speech.apply(effects)
 
     def _check_goal(self, pending: PendingRequest, say: Say) -> tuple[Say, Refusal | None]:
-        """Fill in the id of a goal's voice. Return the new goal, and the reason to refuse it, if any.
+        """Fill in the id of a goal's voice.
+
+        Return the new goal, and the reason to refuse it, if any.
 
         Refusals that need a clock, files or other I/O belong here. The scheduler decides about all others.
         """
@@ -293,7 +304,10 @@ class Requests:
             pending.answer(goals, count=len(ended))
 
     async def _pause(self, pending: PendingRequest, _: Pause) -> None:
-        """Pause speech, and reply when the active goal is silent. Raises RequestRefused if that takes too long."""
+        """Pause speech, and reply when the active goal is silent.
+
+        Raises RequestRefused if that takes too long.
+        """
         speech, scheduler = self._speech, self._scheduler
         speech.advance_time()
         changed, effects, active = not scheduler.paused, scheduler.pause(), scheduler.active
@@ -325,7 +339,10 @@ class Requests:
         self._answer_pause(pending, active)
 
     def _publish_pause(self, affected: Record | None, pending: PendingRequest) -> None:
-        """Publish and log that speech was paused or resumed. `affected` is the goal being spoken, if any."""
+        """Publish and log that speech was paused or resumed.
+
+        `affected` is the goal being spoken, if any.
+        """
         paused, client = self._scheduler.paused, pending.connection.client
         goal_id = affected.id if affected else None
         publish = self._speech.subscribers.paused_changed
@@ -333,7 +350,10 @@ class Requests:
         log.write(f"{'paused' if paused else 'resumed'} by {describe_sender(client)}")
 
     def _answer_pause(self, pending: PendingRequest, goal: Record | None) -> None:
-        """Reply to a `pause` or `resume` request. The reply contains the goal unless it has ended."""
+        """Reply to a `pause` or `resume` request.
+
+        The reply contains the goal unless it has ended.
+        """
         shown = None if goal is None or goal.state.terminal else goal.snapshot().to_json()
         pending.answer(paused=self._scheduler.paused, goal=shown)
 
@@ -406,7 +426,10 @@ def _unknown_message(*ids: str) -> str:
 
 
 def _goal_items(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:
-    """Yield a list item for each goal, with the goal in the field `name`. The goal is copied when the item is sent."""
+    """Yield a list item for each goal, with the goal in the field `name`.
+
+    The goal is copied when the item is sent.
+    """
     return ({name: each.snapshot().to_json()} for each in records)
 
 

@@ -92,7 +92,10 @@ def serve(settings: ServerSettings) -> int:
 
 
 class Server:
-    """A server that handles the connections of its clients. Create it inside a running event loop."""
+    """A server that handles the connections of its clients.
+
+    Create it inside a running event loop.
+    """
 
     def __init__(self, settings: ServerSettings, listener: Listener | InheritedListener) -> None:
         self._settings = settings
@@ -179,7 +182,9 @@ class Server:
             raise self._fatal_error
 
     def _prepare_voice(self) -> str | None:
-        """Return the configured voice if the engine must check it, otherwise None. A neural voice is checked here.
+        """Return the configured voice if the engine must check it, otherwise None.
+
+        A neural voice is checked here.
 
         A neural voice becomes a setting and is loaded later, so that it doesn't delay speech.
 
@@ -196,7 +201,10 @@ class Server:
         return None
 
     def _maintain_socket(self) -> None:
-        """Bind the socket again if clients can't find it, or shut down if that fails. Schedule the next check."""
+        """Bind the socket again if clients can't find it, or shut down if that fails.
+
+        Schedule the next check.
+        """
         self._socket_check = self._loop.call_later(SOCKET_CHECK_S, self._maintain_socket)
         if self._listener.in_place():
             self._unreachable = ""
@@ -237,7 +245,10 @@ class Server:
             self._no_clients.clear()
 
     def left(self, connection: ClientConnection) -> None:
-        """Remove a client, and admit the next waiting one. The goals of the removed client continue."""
+        """Remove a client, and admit the next waiting one.
+
+        The goals of the removed client continue.
+        """
         self.connections.discard(connection)
         if not self.connections:
             self._no_clients.set()
@@ -305,7 +316,10 @@ class Server:
         self._end()
 
     def _on_second_signal(self, number: int, _: object) -> None:
-        """Close the socket and exit immediately. The engine process notices this and exits, too."""
+        """Close the socket and exit immediately.
+
+        The engine process notices this and exits, too.
+        """
         with contextlib.suppress(OSError):
             self._listener.close()
         os._exit(EXIT_SIGNAL + number)

@@ -216,7 +216,10 @@ class Speech:
         return following is not None, following is not None and is_neural(self.scheduler.wanted_voice(following))
 
     def _publish_change(self, record: Record, state: State, at: float) -> None:
-        """Send a goal's new state to clients. If it has ended, log it and resume the requests waiting for it."""
+        """Send a goal's new state to clients.
+
+        If it has ended, log it and resume the requests waiting for it.
+        """
         self.subscribers.state_changed(record, state, at)
         if state.terminal:
             _log_goal_end(record, elapsed() - record.began_at)

@@ -123,7 +123,10 @@ class ClientStream:
     # -- input
 
     def begin(self) -> None:
-        """Send pending output and start reading. Data that has already arrived is read at once."""
+        """Send pending output and start reading.
+
+        Data that has already arrived is read at once.
+        """
         self.flush()
         self.resume_reading()
         if self._reading:
@@ -176,7 +179,10 @@ class ClientStream:
             self._streams.shed_load()
 
     def write(self, data: bytes) -> None:
-        """Queue data to be sent soon. If too much output is unread in total, disconnect the slowest clients."""
+        """Queue data to be sent soon.
+
+        If too much output is unread in total, disconnect the slowest clients.
+        """
         if self.closing:
             return
         self._unread += data
@@ -204,7 +210,10 @@ class ClientStream:
             self.abort()
 
     def _send(self) -> None:
-        """Send as much output as the socket accepts now. If the stream is closing, close it after the last byte."""
+        """Send as much output as the socket accepts now.
+
+        If the stream is closing, close it after the last byte.
+        """
         try:
             sent = self.socket.send(self._unread)
         except BlockingIOError:
@@ -262,7 +271,10 @@ class ClientStream:
 
 
 def raise_descriptor_limit(clients: int) -> int:
-    """Raise the limit of open files to fit this number of clients, or log that it is too low. Return the limit."""
+    """Raise the limit of open files to fit this number of clients, or log that it is too low.
+
+    Return the limit.
+    """
     wanted = clients + RESERVED_DESCRIPTORS + OWN_DESCRIPTORS
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     allowed, most = (2**31 if each == resource.RLIM_INFINITY else each for each in limits)
@@ -280,7 +292,10 @@ def raise_descriptor_limit(clients: int) -> int:
 
 
 class Acceptor:
-    """Accepts connections on a listening socket. Some descriptors stay reserved for the engine."""
+    """Accepts connections on a listening socket.
+
+    Some descriptors stay reserved for the engine.
+    """
 
     def __init__(self, serve: Callable[[socket.socket], None], max_descriptors: int) -> None:
         """Create the acceptor. Call `open` to start.
@@ -311,7 +326,10 @@ class Acceptor:
             self._listening = None
 
     def _accept(self, listening: socket.socket) -> None:
-        """Accept some of the waiting connections, and pass them to `serve`. Pause for a second after an error."""
+        """Accept some of the waiting connections, and pass them to `serve`.
+
+        Pause for a second after an error.
+        """
         for _ in range(ACCEPTS_PER_TURN):
             try:
                 connected, _ = listening.accept()

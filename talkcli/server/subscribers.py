@@ -82,7 +82,10 @@ class Subscribers:
             waiting.pop(connection, None)
 
     def state_changed(self, record: Record, state: State, at: float) -> None:
-        """Publish a goal's new state, and its result if it has ended. Waiting clients are then unsubscribed."""
+        """Publish a goal's new state, and its result if it has ended.
+
+        Waiting clients are then unsubscribed.
+        """
         event = StateChanged(record.id, state, at, next(self._numbers))
         if self._watchers:
             # The first and the last event of a goal contain the whole goal.
@@ -108,7 +111,10 @@ class Subscribers:
         _publish(event.to_json(), self._feedback_receivers([self._waiters.get(word.id, {})]), feedback=True)
 
     def paused_changed(self, goal_id: str | None, *, paused: bool, by: By, at: float) -> None:
-        """Publish that speech was paused or resumed. `goal_id` is the id of the affected goal, if any."""
+        """Publish that speech was paused or resumed.
+
+        `goal_id` is the id of the affected goal, if any.
+        """
         event = PausedChanged(paused, goal_id, by, at, next(self._numbers))
         _publish(event.to_json(), self._feedback_receivers(self._waiters.values()))
 
@@ -134,7 +140,10 @@ class Subscribers:
 
 
 def _publish(event: JsonObject, connections: Iterable[ClientConnection], *, feedback: bool = False) -> None:
-    """Encode an event once, and send it to these connections. Feedback may be dropped for slow clients."""
+    """Encode an event once, and send it to these connections.
+
+    Feedback may be dropped for slow clients.
+    """
     receivers = list(connections)
     line = encode(event) if receivers else b""  # usually, there are no receivers
     for connection in receivers:
@@ -164,7 +173,10 @@ class Notifications:
         return not self._pending
 
     def add(self, notifications: Iterable[Callable[[], None]]) -> None:
-        """Queue functions, and start calling them. If a called function adds more, those are called at once."""
+        """Queue functions, and start calling them.
+
+        If a called function adds more, those are called at once.
+        """
         if self._working:
             for each in notifications:
                 self._call(each)
@@ -202,7 +214,10 @@ class Notifications:
             self._turn = self._loop.call_soon(self._work, min(unread_before, self._streams.unread_bytes))
 
     def _await_readers(self, unread_before: int, until: float) -> None:
-        """Continue if clients have read the new output or the time `until` has come. Otherwise, check again soon."""
+        """Continue if clients have read the new output or the time `until` has come.
+
+        Otherwise, check again soon.
+        """
         if self._streams.unread_bytes <= unread_before:
             self._work(unread_before)
         elif self._loop.time() < until:

@@ -1,4 +1,6 @@
-"""Finds the voice that a client asks for. `goals.voices` decides when voices are loaded.
+"""Finds the voice that a client asks for.
+
+`goals.voices` decides when voices are loaded.
 
 The directories of neural voices are read only if a client asks for a voice that the engine has not listed.
 """
@@ -62,7 +64,10 @@ class VoiceCatalog:
             return 0
 
     def _find(self, voice: str, settings_voice: str | None) -> Voice | None:
-        """Return the voice that matches the client's input, or None. Read directories only if necessary."""
+        """Return the voice that matches the client's input, or None.
+
+        Read directories only if necessary.
+        """
         if not (is_neural(voice) or is_neural(settings_voice or "")):
             found = find_voice(voice, self._driver_voices)
             if found is not None:

@@ -177,7 +177,10 @@ def format_duration(seconds: float) -> str:
 
 
 def _goal_table(label: str, goals: Sequence[Goal], id_columns: int, screen: Screen, now: float) -> list[str]:
-    """Return one line for each goal, cut to the width of the terminal. The first one starts with the label."""
+    """Return one line for each goal, cut to the width of the terminal.
+
+    The first one starts with the label.
+    """
     labels = [label, *[""] * (len(goals) - 1)]
     heads = [
         _pad_label(name) + _head_columns(goal, id_columns, screen) for name, goal in zip(labels, goals, strict=True)
@@ -212,7 +215,10 @@ def quoted_text(goal: Goal, limit: int | None = None) -> str:
 
 
 def _quote(text: str | None, limit: int | None = None) -> str | None:
-    """Escape a text, cut it to `limit` characters and put it in quotes. Return None if the text is None."""
+    """Escape a text, cut it to `limit` characters and put it in quotes.
+
+    Return None if the text is None.
+    """
     return None if text is None else f'"{printable(text, limit)}"'
 
 
@@ -229,7 +235,10 @@ def _unfinished_details(goal: Goal, now: float) -> list[str]:
 
 
 def _describe_time_left(goal: Goal, now: float) -> str | None:
-    """Describe how much time a pending goal has left before it expires. Return None if it has no ttl."""
+    """Describe how much time a pending goal has left before it expires.
+
+    Return None if it has no ttl.
+    """
     if goal.state is not State.PENDING or not goal.ttl or goal.queued_at is None:
         return None
     left = max(0.0, goal.queued_at + goal.ttl - now)
@@ -271,14 +280,20 @@ def _describe_cause(by: By) -> str:
 
 
 def listed_reason_forms(goal: Goal, screen: Screen) -> list[str]:
-    """Return descriptions of why a goal ended, longest first. The duration is only shown with `screen.long`."""
+    """Return descriptions of why a goal ended, longest first.
+
+    The duration is only shown with `screen.long`.
+    """
     if goal.state is State.SUCCEEDED and not screen.long:
         return _muted_note(goal) or [""]
     return reason_forms(goal, screen)
 
 
 def reason_forms(goal: Goal, screen: Screen) -> list[str]:
-    """Return descriptions of why a goal ended, longest first. For a success, return the duration instead."""
+    """Return descriptions of why a goal ended, longest first.
+
+    For a success, return the duration instead.
+    """
     if goal.state is State.SUCCEEDED:
         return [", ".join([*([] if goal.duration is None else [f"{goal.duration:.1f} s"]), *_muted_note(goal)])]
     reason = printable(goal.reason or goal.state.name.lower())

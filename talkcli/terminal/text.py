@@ -91,7 +91,10 @@ class Screen:
         return self.fit_name(number if number.isdecimal() else goal_id, _MIN_ID_COLUMNS, 8)
 
     def coloured(self, text: str, state: State | None) -> str:
-        """Colour a text by its state, or make it bold if the state is None. Without colours, return it unchanged."""
+        """Colour a text by its state, or make it bold if the state is None.
+
+        Without colours, return it unchanged.
+        """
         code = _STATE_COLOURS.get(state) if state is not None else "1"
         return f"\x1b[{code}m{text}\x1b[0m" if self.colour and code else text
 
@@ -181,7 +184,9 @@ def fit_row(head: str, text: str, details: Sequence[str], text_columns: int, scr
 
 
 def wrap(pieces: Sequence[str], head: str, screen: Screen) -> list[str]:
-    """Join pieces of text with spaces, and wrap them into lines that fit the screen. `head` starts the first line.
+    """Join pieces of text with spaces, and wrap them into lines that fit the screen.
+
+    `head` starts the first line.
 
     The other lines are indented by its width. Lines are only broken between pieces.
     """

@@ -99,7 +99,10 @@ class Transcript:
         self._widths = widths or ColumnWidths()
 
     def lines(self, event: Event, screen: Screen, now: float) -> list[str]:
-        """Return the lines that show an event, and remember its goal. `now` is shown if the event has no time."""
+        """Return the lines that show an event, and remember its goal.
+
+        `now` is shown if the event has no time.
+        """
         if isinstance(event, Snapshot):
             self._boot = str(event.status.server.get("boot"))
         screen = replace(screen, boot=self._boot)
@@ -160,7 +163,10 @@ class Transcript:
         return (head + longest_fitting(forms, screen.columns_left(width(head)))).rstrip()
 
     def _format_goal(self, goal: Goal, state: State, at: float, screen: Screen) -> list[str]:
-        """Return the lines that show a goal with its state, text, and sender or reason. `at` is a timestamp."""
+        """Return the lines that show a goal with its state, text, and sender or reason.
+
+        `at` is a timestamp.
+        """
         head = self._head_columns(at, state.name, state, goal.id, screen)
         ended = state.terminal
         forms = reason_forms(goal, screen) if ended else sender_forms(goal.client, screen)

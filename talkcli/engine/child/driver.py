@@ -41,7 +41,10 @@ class CannotStart(Exception):
     """
 
     def __init__(self, message: str, reason: Reason = Reason.ENGINE_FAILED, **more: bool) -> None:
-        """Create the error and its `StartFailed` message. `more` contains further fields of the message."""
+        """Create the error and its `StartFailed` message.
+
+        `more` contains further fields of the message.
+        """
         super().__init__(message)
         self.failure = protocol.StartFailed(reason, message, **more)
 
@@ -165,7 +168,9 @@ class DriverProperties:
         engine.connect("error", self._record_error)
 
     def apply(self, command: protocol.Speak) -> str | None:
-        """Set the properties for a goal. Return the reason if another voice had to be used, otherwise None.
+        """Set the properties for a goal.
+
+        Return the reason if another voice had to be used, otherwise None.
 
         A neural voice may have disappeared since the goal was accepted. The driver then falls back to another of its
         voices, preferably in the same language. It doesn't do so if `voice_only` is set.
@@ -307,7 +312,9 @@ class Driver:
         return self._synthesizer.voice if name == "voice" else fields(self._sound)[name]
 
     def setProperty(self, name: str, value: Any) -> None:  # noqa: N802 - pyttsx3's name
-        """Load a voice if the property is "voice". Otherwise, change a setting for the next sentences.
+        """Load a voice if the property is "voice".
+
+        Otherwise, change a setting for the next sentences.
 
         Raises:
             KeyError: the property is unknown.

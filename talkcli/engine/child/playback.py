@@ -116,7 +116,10 @@ class SentenceSamples:
         return (len(self._kept) - len(self._kept.lstrip(b"\0"))) // SAMPLE_BYTES * SAMPLE_BYTES
 
     def part(self, begin: int, end: int) -> memoryview:
-        """Return a view of the samples between two offsets. Release it before adding or dropping samples."""
+        """Return a view of the samples between two offsets.
+
+        Release it before adding or dropping samples.
+        """
         return memoryview(self._kept)[begin - self.begin : end - self.begin]
 
     def drop_until(self, offset: int) -> None:
@@ -161,7 +164,10 @@ class PlayerFeed:
         clock.reset(begin)
 
     def offer(self, samples: memoryview) -> int:
-        """Offer samples to the player, and return the number of bytes accepted. The first samples start the clock."""
+        """Offer samples to the player, and return the number of bytes accepted.
+
+        The first samples start the clock.
+        """
         taken = self.player.offer(samples)
         if taken:
             now = time.monotonic()
@@ -186,7 +192,10 @@ class PlayerFeed:
         return taken
 
     def update(self, now: float, *, complete: bool) -> None:
-        """Adjust the clock to the player's progress. Set `complete` if nothing more will be written."""
+        """Adjust the clock to the player's progress.
+
+        Set `complete` if nothing more will be written.
+        """
         consumed = self.player.consumed()
         if consumed > self.consumed:
             if self.consumed == 0:  # the device has just been opened; before that, samples wait in the player's pipe
@@ -227,7 +236,10 @@ class PlayerFeed:
 
 
 class _PlayerReleased(Exception):
-    """Raised if the player was released during a pause. After the pause, a new player repeats the current step."""
+    """Raised if the player was released during a pause.
+
+    After the pause, a new player repeats the current step.
+    """
 
 
 class Playback:
@@ -374,7 +386,9 @@ class Playback:
     # -- choosing a player
 
     def _with_player(self, step: Callable[[PlayerFeed], None]) -> None:
-        """Call `step` with the current player. If the player fails or was released, call `step` with the next player.
+        """Call `step` with the current player.
+
+        If the player fails or was released, call `step` with the next player.
 
         The call is repeated if the player fails before any sound was heard, or was released during a pause.
         """
@@ -426,27 +440,39 @@ class Playback:
             self._wait(until=time.monotonic() + DEVICE_RETRY_INTERVAL_S)
 
     def _may_retry_busy_device(self, error: CannotSpeak) -> bool:
-        """Return whether the device is busy and may be tried again. The first call starts the time limit."""
+        """Return whether the device is busy and may be tried again.
+
+        The first call starts the time limit.
+        """
         if error.reason != Reason.AUDIO_DEVICE or "busy" not in str(error).lower():
             return False
         self._busy_until = self._busy_until or time.monotonic() + DEVICE_BUSY_LIMIT_S
         return time.monotonic() < self._busy_until
 
     def _release_player(self, next_begin: int) -> None:
-        """Kill the player. The best player then continues the sentence at the offset `next_begin`."""
+        """Kill the player.
+
+        The best player then continues the sentence at the offset `next_begin`.
+        """
         self._begin = self._sent = next_begin
         self._untried = self._first_error = None
         self.silence()
 
     def _release_and_rewind(self, feed: PlayerFeed) -> None:
-        """Release a player that still has sound in its buffer. The next player repeats the unheard sound."""
+        """Release a player that still has sound in its buffer.
+
+        The next player repeats the unheard sound.
+        """
         feed.update(time.monotonic(), complete=False)
         self._release_player(self._unheard_begin() if feed.player.proven else self._begin)
 
     # -- steps
 
     def _send_all(self, feed: PlayerFeed) -> None:
-        """Send the player all samples up to `_sendable_end`. Play silence while the sentence is paused."""
+        """Send the player all samples up to `_sendable_end`.
+
+        Play silence while the sentence is paused.
+        """
         if feed.written == 0:
             feed.progress_at = time.monotonic()  # until now, the player had nothing to play
         while True:
@@ -499,7 +525,9 @@ class Playback:
     # -- samples
 
     def _skip_leading_zeros(self) -> bool:
-        """Decide how many zero samples at the beginning to skip. Return False if it is too early to decide.
+        """Decide how many zero samples at the beginning to skip.
+
+        Return False if it is too early to decide.
 
         Zeros before the first sound are skipped, so that it is heard earlier. They are kept in a file. They are also
         kept after another sentence, because they are part of the silence between the two sentences.
@@ -600,7 +628,10 @@ class Playback:
         feed.progress_at = time.monotonic()
 
     def _await_silence(self, feed: PlayerFeed) -> None:
-        """Wait until the player has played its buffer or the sentence continues. Replace a player that is too slow."""
+        """Wait until the player has played its buffer or the sentence continues.
+
+        Replace a player that is too slow.
+        """
         self._update_progress(feed)
         written, now = feed.written, time.monotonic()
         deadline = now + HOLD_SILENCE_LIMIT_S
@@ -631,7 +662,10 @@ class Playback:
     # -- waiting
 
     def _wait_for_continue(self) -> None:
-        """Confirm the pause, and wait until the sentence continues. There is no player meanwhile."""
+        """Confirm the pause, and wait until the sentence continues.
+
+        There is no player meanwhile.
+        """
         while self._runner.hold_number:
             self._runner.confirm_hold()
             self._wait()
@@ -657,7 +691,10 @@ class Playback:
         self._wait(interests, until)
 
     def _wait(self, interests: Sequence[Interest] = (), until: float = NEVER) -> None:
-        """Let the runner wait and execute commands. If the sentence has been stopped, raise Stopped."""
+        """Let the runner wait and execute commands.
+
+        If the sentence has been stopped, raise Stopped.
+        """
         self._runner.wait(interests, until)
         self._raise_if_stopped()
 

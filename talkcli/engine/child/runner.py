@@ -70,7 +70,10 @@ class Channel:
             self.closed = True
 
     def receive(self) -> list[protocol.Command]:
-        """Wait for data, and return all complete commands. If the server has closed the connection, set `closed`."""
+        """Wait for data, and return all complete commands.
+
+        If the server has closed the connection, set `closed`.
+        """
         try:
             data = os.read(self.descriptor, 65536)
         except ConnectionResetError:
@@ -117,7 +120,10 @@ class ActiveGoal:
 
 
 class GoalRunner:
-    """Executes the server's commands, and speaks its goals. Call `attach_engine` once, and then `run`."""
+    """Executes the server's commands, and speaks its goals.
+
+    Call `attach_engine` once, and then `run`.
+    """
 
     def __init__(self, channel: Channel, players: PlayerChooser) -> None:
         """Create a runner without an engine.
@@ -187,7 +193,9 @@ class GoalRunner:
                 self._speak(self._goal)
 
     def wait(self, interests: Iterable[Interest] = (), until: float = NEVER) -> None:
-        """Wait for a descriptor, a command or a time limit. Execute arriving commands, and send events that are due.
+        """Wait for a descriptor, a command or a time limit.
+
+        Execute arriving commands, and send events that are due.
 
         This method may return early. By then, a command may have stopped or paused the sentence.
 
@@ -259,7 +267,10 @@ class GoalRunner:
             self._channel.send(protocol.VoiceChosen(goal.id, voice, fallback_reason or goal.fallback_reason))
 
     def confirm_hold(self) -> None:
-        """Confirm to the server that the paused goal is silent. Each pause is confirmed only once."""
+        """Confirm to the server that the paused goal is silent.
+
+        Each pause is confirmed only once.
+        """
         goal = self._goal
         if goal is not None and not goal.stop_requested and goal.confirmed_hold != self.hold_number:
             goal.confirmed_hold = self.hold_number
@@ -389,7 +400,9 @@ class GoalRunner:
         return self._channel.sent_at + protocol.ALIVE_INTERVAL_S
 
     def _notice_overdue(self, goal: ActiveGoal) -> bool:
-        """Return whether a third-party driver takes too long for the text. Log this once for each goal.
+        """Return whether a third-party driver takes too long for the text.
+
+        Log this once for each goal.
 
         The process then sends no `Alive`, so that the server kills it. There may be no other way to stop the driver.
         """

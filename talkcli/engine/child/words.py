@@ -123,13 +123,19 @@ class WordClock:
         self._started_at = now
 
     def add_silence(self, position: float, seconds: float) -> None:
-        """Record silence in the stream before this position in the audio. Positions must not decrease."""
+        """Record silence in the stream before this position in the audio.
+
+        Positions must not decrease.
+        """
         if self._silences and self._silences[-1][0] == position:
             seconds += self._silences.pop()[1]
         self._silences.append((position, seconds))
 
     def set_elapsed(self, now: float, elapsed: float) -> None:
-        """Set the number of seconds heard, as reported by the output. A value of 0 stops the clock."""
+        """Set the number of seconds heard, as reported by the output.
+
+        A value of 0 stops the clock.
+        """
         self._started_at = now - elapsed if elapsed > 0 else None
 
     def limit_elapsed(self, now: float, elapsed: float) -> None:

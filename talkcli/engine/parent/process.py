@@ -111,7 +111,9 @@ class EngineProcess:
             return False
 
     def receive(self) -> Iterator[protocol.Event | None]:
-        """Yield the events that have arrived, without blocking. The last one is None if the connection has ended.
+        """Yield the events that have arrived, without blocking.
+
+        The last one is None if the connection has ended.
 
         A malformed message counts as the end of the connection.
         """
@@ -240,7 +242,10 @@ class PrivateEngine(contextlib.AbstractContextManager["PrivateEngine"]):
         self._process.close()
 
     def speak(self, command: protocol.GoalCommand) -> None:
-        """Tell the process to speak a text. It must be ready, and must have finished the previous text."""
+        """Tell the process to speak a text.
+
+        It must be ready, and must have finished the previous text.
+        """
         self._last_event_at = time.monotonic()
         self._process.send(command)  # if this fails, `wait_for` raises an error
 
@@ -255,7 +260,10 @@ class PrivateEngine(contextlib.AbstractContextManager["PrivateEngine"]):
         return next(event for event in self.events if isinstance(event, event_class))
 
     def _receive_events(self) -> Iterator[protocol.Event]:
-        """Yield the events of the process endlessly. Raise an error if it fails or a time limit has passed."""
+        """Yield the events of the process endlessly.
+
+        Raise an error if it fails or a time limit has passed.
+        """
         process = self._process
         watched = {process.socket.fileno(): select.POLLIN, process.stderr: select.POLLIN}
         while True:

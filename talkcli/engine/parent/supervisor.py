@@ -48,14 +48,20 @@ class EngineDied:
 
 @frozen
 class EngineMissing:
-    """The engine has failed to start for a long time. The next goal fails with this message."""
+    """The engine has failed to start for a long time.
+
+    The next goal fails with this message.
+    """
 
     message: str
 
 
 @frozen
 class EngineSaid:
-    """A line from the engine process's standard error, for the log. It may contain parts of a goal's text."""
+    """A line from the engine process's standard error, for the log.
+
+    It may contain parts of a goal's text.
+    """
 
     line: str
 
@@ -134,7 +140,9 @@ class RestartPolicy:
             self._back_off(now)
 
     def start_failed(self, now: float, started_at: float, permanent_error: str | None) -> bool:
-        """Schedule the next start after a failed one. Return whether goals have waited too long.
+        """Schedule the next start after a failed one.
+
+        Return whether goals have waited too long.
 
         Args:
             now: the current time.
@@ -153,7 +161,10 @@ class RestartPolicy:
 
 @dataclass(slots=True, eq=False)
 class SupervisedGoal:
-    """The state of a goal from its submission until its `Ended` is posted. Times are monotonic."""
+    """The state of a goal from its submission until its `Ended` is posted.
+
+    Times are monotonic.
+    """
 
     command: protocol.GoalCommand
     #: whether the goal was sent to the current process
@@ -216,7 +227,10 @@ class Supervisor:
         self._actions.call(lambda: self._stop_goal(goal_id))
 
     def pause(self, goal_id: str, number: int) -> None:
-        """Pause the goal. `Held` is posted once the goal is silent, unless the goal is being stopped."""
+        """Pause the goal.
+
+        `Held` is posted once the goal is silent, unless the goal is being stopped.
+        """
         self._actions.call(lambda: self._hold_goal(goal_id, number))
 
     def resume(self, goal_id: str) -> None:
@@ -233,7 +247,10 @@ class Supervisor:
         self._actions.call(lambda: self._process and self._process.send(command))
 
     def load(self, voice: str) -> None:
-        """Load a neural voice if an engine process is ready. `VoiceLoaded` is posted when it has finished or failed."""
+        """Load a neural voice if an engine process is ready.
+
+        `VoiceLoaded` is posted when it has finished or failed.
+        """
         self._actions.call(lambda: self._load_voice(voice))
 
     def drop(self, voice: str) -> None:
@@ -241,7 +258,10 @@ class Supervisor:
         self._actions.call(lambda: self._send(protocol.DropVoice(voice)))
 
     def give_up(self, goal_id: str) -> None:
-        """Abandon a goal that didn't end in time, and replace its process. No `Ended` is posted for the goal."""
+        """Abandon a goal that didn't end in time, and replace its process.
+
+        No `Ended` is posted for the goal.
+        """
         self._actions.call(lambda: self._give_up_goal(goal_id))
 
     def close(self) -> None:
@@ -252,7 +272,10 @@ class Supervisor:
     # -- the loop
 
     def _run(self) -> None:
-        """Run the engine thread until `close` is called. Report bugs, because otherwise goals would wait forever."""
+        """Run the engine thread until `close` is called.
+
+        Report bugs, because otherwise goals would wait forever.
+        """
         try:
             while not self._closing:
                 # The time is taken before waiting. If the machine is suspended during the wait, messages that have
@@ -331,7 +354,10 @@ class Supervisor:
         return self._goal if self._goal and self._goal.command.id == goal_id else None
 
     def _begin_goal(self, command: protocol.GoalCommand) -> None:
-        """Make this the current goal, and send it to the process. If no process can start, fail the goal."""
+        """Make this the current goal, and send it to the process.
+
+        If no process can start, fail the goal.
+        """
         self._goal = SupervisedGoal(command)
         if self._restarts.permanent_error is not None:
             self._fail_goal(self._goal, Reason.ENGINE_FAILED, self._restarts.permanent_error)
@@ -346,12 +372,18 @@ class Supervisor:
             goal.sent = self._send(goal.command)
 
     def _load_voice(self, voice: str) -> None:
-        """Load a voice. If no process is ready, do nothing, because the server repeats the command to the next one."""
+        """Load a voice.
+
+        If no process is ready, do nothing, because the server repeats the command to the next one.
+        """
         if self._send(protocol.LoadVoice(voice)):
             self._loading, self._last_sign_at = voice, time.monotonic()
 
     def _send(self, command: protocol.Command) -> bool:
-        """Send a command if the process is ready, and return whether it was sent. Replace a process that refuses it."""
+        """Send a command if the process is ready, and return whether it was sent.
+
+        Replace a process that refuses it.
+        """
         process = self._process
         if process is None or not process.ready:
             return False
@@ -377,7 +409,10 @@ class Supervisor:
             self._send_waiting_goal()
 
     def _stop_goal(self, goal_id: str) -> None:
-        """Tell the process to stop the goal. If the process doesn't have the goal, end it as stopped."""
+        """Tell the process to stop the goal.
+
+        If the process doesn't have the goal, end it as stopped.
+        """
         goal = self._current_goal(goal_id)
         if goal is None or goal.stop_due != NEVER:
             return
@@ -518,7 +553,10 @@ class Supervisor:
         goal.sent, goal.stop_due, goal.hold_due = False, NEVER, NEVER
 
     def _handle_failed_start(self, message: str, *, permanent: bool = False) -> None:
-        """Schedule another start. Fail the waiting goal if the error is permanent or the goal has waited too long."""
+        """Schedule another start.
+
+        Fail the waiting goal if the error is permanent or the goal has waited too long.
+        """
         ends_goal = self._restarts.start_failed(time.monotonic(), self._started_at, message if permanent else None)
         waiting = self._goal if self._goal and not self._goal.end else None
         if waiting and (ends_goal or permanent):

@@ -124,7 +124,10 @@ class Policy:
         self.newest_echo_at = 0.0
 
     def record_echo(self, sent_at_text: bytes, now: float) -> None:
-        """Record that an echo has returned. Ignore it if its time is invalid or later than `now`."""
+        """Record that an echo has returned.
+
+        Ignore it if its time is invalid or later than `now`.
+        """
         with contextlib.suppress(ValueError):
             sent_at = float(sent_at_text)
             if self.newest_echo_at < sent_at <= now:
@@ -213,7 +216,10 @@ class SentIds:
         return self._sent.get(goal_id) == (boot, True)
 
     def add(self, goal_id: str, boot: str, *, counted: bool = True) -> None:
-        """Record that a goal was sent to the server with this boot id. Forget the oldest goal if there are too many."""
+        """Record that a goal was sent to the server with this boot id.
+
+        Forget the oldest goal if there are too many.
+        """
         self._sent.pop(goal_id, None)
         self._sent[goal_id] = boot, counted
         if len(self._sent) > MAX_REMEMBERED_IDS:
@@ -261,7 +267,9 @@ class RemoteGoals:
         self._goals.setdefault(goal_id, (key, False))
 
     def record_reply(self, goal_id: str, *, pending: bool) -> None:
-        """Record from the server's reply to `say` whether a goal is pending. If it isn't, remove the goal.
+        """Record from the server's reply to `say` whether a goal is pending.
+
+        If it isn't, remove the goal.
 
         The reply is ignored if an event has already confirmed that the goal is pending.
 

@@ -1,4 +1,6 @@
-"""Sessions of remote clients. Each session is one client's connection to the robot's server.
+"""Sessions of remote clients.
+
+Each session is one client's connection to the robot's server.
 
 A session sends its client's requests to the server and publishes the server's lines in their order. `policy` has
 already accepted the requests. If too many goals are pending, a patient goal waits here for room, and other goals are
@@ -94,7 +96,10 @@ class RemoteSessions:
     # -- from the broker
 
     def submit(self, request: RemoteRequest) -> None:
-        """Pass a request to its client's session. Create the session, or refuse the request if there are too many."""
+        """Pass a request to its client's session.
+
+        Create the session, or refuse the request if there are too many.
+        """
         key = request.user, request.reply_topic
         session = self._sessions.get(key) or RemoteSession(self, *key)
         if key in self._sessions or self._make_room(urgent=isinstance(request.request, Cancel | Status)):
@@ -128,7 +133,9 @@ class RemoteSessions:
                 session.send_alive()
 
     def _make_room(self, *, urgent: bool) -> bool:
-        """End an idle session if there are too many sessions. Return whether there is room for a new one.
+        """End an idle session if there are too many sessions.
+
+        Return whether there is room for a new one.
 
         For an `urgent` request, any session may be ended.
         """
@@ -193,7 +200,9 @@ class RemoteSessions:
         self.handle_pending_change()
 
     def remember(self, goal: Goal, boot: str) -> None:
-        """Remember the id of a remote client's goal, in case an earlier bridge process sent it. Ignore other goals.
+        """Remember the id of a remote client's goal, in case an earlier bridge process sent it.
+
+        Ignore other goals.
 
         The goal counts towards the limit even if it was sent with `preempt`, because the server doesn't report that.
         """
@@ -224,7 +233,10 @@ class _RemoteExchange(Exchange):
 
 
 class RemoteSession:
-    """One remote client's connection to the server. All methods run in the event loop's thread."""
+    """One remote client's connection to the server.
+
+    All methods run in the event loop's thread.
+    """
 
     def __init__(self, sessions: RemoteSessions, user: str, reply_topic: str | None) -> None:
         """Create a session that isn't connected to the server yet.
@@ -288,7 +300,9 @@ class RemoteSession:
         self._end_if_done()
 
     def end(self, why: str | None = None) -> None:
-        """End the session, and drop its queued requests. The server cancels unfinished requests, if possible.
+        """End the session, and drop its queued requests.
+
+        The server cancels unfinished requests, if possible.
 
         Args:
             why: a message for the client, which is sent only if the client is waiting for something.
@@ -336,7 +350,10 @@ class RemoteSession:
     # -- to the server
 
     def _send_request(self, remote: RemoteRequest) -> None:
-        """Send a client's request to the server. Goals may have to wait, and `cancel` first cancels waiting goals."""
+        """Send a client's request to the server.
+
+        Goals may have to wait, and `cancel` first cancels waiting goals.
+        """
         request = remote.request
         if isinstance(request, Say):
             self.send_say(remote, request)
@@ -350,7 +367,9 @@ class RemoteSession:
             self._send(_RemoteExchange(remote, request))
 
     def send_say(self, remote: RemoteRequest, say: Say, *, has_room: bool = False) -> None:
-        """Send a goal to the server, or reject it if too many goals are pending. Patient goals wait for room.
+        """Send a goal to the server, or reject it if too many goals are pending.
+
+        Patient goals wait for room.
 
         Args:
             remote: the client's request.
@@ -451,7 +470,10 @@ class RemoteSession:
         self._end_if_done()
 
     def _process_answer(self, message: JsonObject) -> list[tuple[bytes, bytes | None]]:
-        """Process one line of the server's answer. Return lines for the client, with their correlation data."""
+        """Process one line of the server's answer.
+
+        Return lines for the client, with their correlation data.
+        """
         assert self._server
         exchange = self._server.match(message)
         if not isinstance(exchange, _RemoteExchange):
@@ -475,7 +497,10 @@ class RemoteSession:
         return [(encode(item(remote.seq, **each)), remote.correlation) for each in (*found, message)]
 
     def _record_say_reply(self, exchange: _RemoteExchange, state: State | None, *, refused: bool) -> None:
-        """If a request is a `say`, record whether its goal is pending. Forget the id of a refused goal."""
+        """If a request is a `say`, record whether its goal is pending.
+
+        Forget the id of a refused goal.
+        """
         if exchange.goal_id is not None:
             self._sessions.goals.record_reply(exchange.goal_id, pending=state is State.PENDING)
             if exchange.is_new and refused:

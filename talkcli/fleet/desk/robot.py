@@ -49,7 +49,10 @@ _MAX_OPEN_LOOKUPS = 32
 
 
 class RobotExchange(Exchange):
-    """A request to a robot, and the robot's answer. The request stays open while the robot is absent."""
+    """A request to a robot, and the robot's answer.
+
+    The request stays open while the robot is absent.
+    """
 
     #: how many times the request has been sent again
     resends = 0
@@ -229,7 +232,9 @@ class RobotConnection(Connection):
             self.absent_since = time.monotonic()
 
     def _update_presence(self, payload: bytes) -> None:
-        """Read from a presence message whether the robot is absent. When it is back, send open requests again.
+        """Read from a presence message whether the robot is absent.
+
+        When it is back, send open requests again.
 
         It comes from the robot's bridge, or from the broker if the bridge has lost its connection.
         """
@@ -252,7 +257,9 @@ class RobotConnection(Connection):
     # -- connecting
 
     def wait_online(self, give_up: float) -> None:
-        """Wait until the robot can receive requests. Raises an error if it still can't at the time `give_up`.
+        """Wait until the robot can receive requests.
+
+        Raises an error if it still can't at the time `give_up`.
 
         `give_up` is a monotonic time. The errors are the same as those of `connect_robot`.
         """
@@ -298,7 +305,10 @@ class RobotConnection(Connection):
             self._watch_again(now)
 
     def _resend(self, exchange: RobotExchange) -> None:
-        """Send a request again. It fails if its ttl has expired, or if it has been sent too many times."""
+        """Send a request again.
+
+        It fails if its ttl has expired, or if it has been sent too many times.
+        """
         if exchange.number not in self.exchanges:
             return  # The caller has stopped waiting for the answer.
         request = exchange.request
@@ -317,12 +327,18 @@ class RobotConnection(Connection):
         self._publish(exchange)
 
     def _lost_error(self, exchange: Exchange, why: str) -> Lost:
-        """Return the error for a request that was sent but not answered. `why` says why the answer is missing."""
+        """Return the error for a request that was sent but not answered.
+
+        `why` says why the answer is missing.
+        """
         words = f"the {exchange.request.kind} request was sent to {self.path}, but {why}"
         return Lost(f"{words}; it may have been carried out")
 
     def _look_up_goal(self, exchange: RobotExchange, request: Say, now: float) -> None:
-        """Ask the robot whether it has accepted a goal. If it doesn't know the goal, send the goal again."""
+        """Ask the robot whether it has accepted a goal.
+
+        If it doesn't know the goal, send the goal again.
+        """
 
         def on_reply(_: JsonObject, items: list[JsonObject]) -> None:
             for each in items:
@@ -353,7 +369,10 @@ class RobotConnection(Connection):
             self._publish(exchange)
 
     def dispatch(self, message: JsonObject, now: float) -> Exchange | None:
-        """Process a message from the robot's server or bridge. Return the exchange that it ends, or None."""
+        """Process a message from the robot's server or bridge.
+
+        Return the exchange that it ends, or None.
+        """
         if message.get("event") == "gone":
             self.end(printable(str(message.get("message") or "the connection to the server was lost")))
             return None
@@ -375,7 +394,10 @@ class RobotConnection(Connection):
         self._desk.wake()
 
     def _drop(self) -> None:
-        """Close the connection to the broker. In a forked child, close only the child's descriptors."""
+        """Close the connection to the broker.
+
+        In a forked child, close only the child's descriptors.
+        """
         self._desk.close(forked=os.getpid() != self._process)
 
 
@@ -409,5 +431,8 @@ def connect_robot(robot: str, broker: Broker, *, keep_trying: float = 0.0, **opt
 
 
 def new_goal_id(desk: DeskLink) -> str:
-    """Return a new random goal id, which begins with the user's name. The colon sets it apart from servers' ids."""
+    """Return a new random goal id, which begins with the user's name.
+
+    The colon sets it apart from servers' ids.
+    """
     return f"{desk.user[:_ID_USER_CHARS]}:{os.urandom(5).hex()}"

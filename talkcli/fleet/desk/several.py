@@ -142,7 +142,9 @@ class FleetRequest:
         return None if self._desk.link else f"the connection to the broker at {self._desk.broker.url} was lost"
 
     def results(self, timeout: float | None = None) -> Iterator[Outcome]:
-        """Yield the outcomes as they arrive. Raises TimeoutError if some are missing after `timeout` seconds.
+        """Yield the outcomes as they arrive.
+
+        Raises TimeoutError if some are missing after `timeout` seconds.
 
         After a TimeoutError or Interrupted, call this again to receive the remaining outcomes.
 
@@ -228,11 +230,17 @@ class FleetRequest:
                 self._on_presence(robot, robot.presence)
 
     def _on_refused(self, error: TalkError) -> None:
-        """Store an error for `results` to raise. Called if the broker rejects the message to the group."""
+        """Store an error for `results` to raise.
+
+        Called if the broker rejects the message to the group.
+        """
         self._refused = error
 
     def _check_for_late_robots(self) -> None:
-        """Process all waiting messages. Then record a failure for each robot that hasn't answered in time."""
+        """Process all waiting messages.
+
+        Then record a failure for each robot that hasn't answered in time.
+        """
         for _ in range(_MAX_MESSAGES_PER_CHECK):
             if not self._desk.poll(0.0, self._interrupt):
                 break
@@ -280,7 +288,9 @@ class FleetRequest:
                 self._on_presence(robot, presence)
 
     def _on_presence(self, robot: RobotRequest, presence: Presence) -> None:
-        """Include a robot in the request when its presence first arrives. Send the request if possible.
+        """Include a robot in the request when its presence first arrives.
+
+        Send the request if possible.
 
         After all retained messages have arrived, new robots are ignored, because they came online too late. Until then,
         every member of a group is expected to answer. Some members may have come online after the request was sent, but
@@ -357,7 +367,10 @@ class RobotRequest:
         self._since = time.monotonic()
 
     def send(self) -> None:
-        """Send the request to this robot only, not to its group. Record a failure if the robot is absent."""
+        """Send the request to this robot only, not to its group.
+
+        Record a failure if the robot is absent.
+        """
         try:
             self.connection.check_online()
             self.connection.begin(self._request, self._on_reply, self._on_failure)
@@ -398,7 +411,10 @@ class RobotRequest:
             self._record(Outcome(self._name, handle.state.name, code, handle.goal, last=not self._handles))
 
     def _on_reply(self, reply: JsonObject, items: list[JsonObject]) -> None:
-        """Start waiting for the goals of the request. If there are none to wait for, record the outcomes."""
+        """Start waiting for the goals of the request.
+
+        If there are none to wait for, record the outcomes.
+        """
         request = self._request
         found: list[Goal] = []
         if isinstance(request, Say):

@@ -77,7 +77,10 @@ class EventsMissed:
 
 @frozen
 class BrokerAway:
-    """Reports that the connection to the broker was lost. The watch fails if it isn't back within `limit` seconds."""
+    """Reports that the connection to the broker was lost.
+
+    The watch fails if it isn't back within `limit` seconds.
+    """
 
     why: str
     limit: float
@@ -96,7 +99,9 @@ FleetEvent = FleetSnapshot | RobotChanged | RobotEvent | EventsMissed | BrokerAw
 def read_robots(
     broker: Broker, timeout: float, name: str | None = None, *, with_status: bool = True
 ) -> list[RobotInfo]:
-    """Read the robots of a fleet from the broker, sorted by name. This includes robots that are offline.
+    """Read the robots of a fleet from the broker, sorted by name.
+
+    This includes robots that are offline.
 
     Args:
         broker: the broker of the fleet.
@@ -139,7 +144,10 @@ class _RetainedReader:
 
 
 def _read_states(messages: list[Message]) -> list[RobotInfo]:
-    """Read the state of each robot from these messages, sorted by name. Omit robots without a presence."""
+    """Read the state of each robot from these messages, sorted by name.
+
+    Omit robots without a presence.
+    """
     payloads: dict[str, dict[str, bytes]] = {}
     for message in messages:
         _, _, name, kind, *_ = message.topic.split("/")
@@ -178,7 +186,9 @@ class FleetWatch:
         self._missing: dict[str, float] = {}
 
     def events(self, interrupt: Mapping[int, int] | None = None) -> Iterator[FleetEvent]:
-        """Yield events until one of the `interrupt` descriptors is ready. The first event is a FleetSnapshot.
+        """Yield events until one of the `interrupt` descriptors is ready.
+
+        The first event is a FleetSnapshot.
 
         Raises:
             Interrupted: One of the descriptors is ready, see `wait_ready`.
@@ -215,7 +225,10 @@ class FleetWatch:
             self._events.append(BrokerAway(why, ABSENCE_LIMIT_S))
 
     def on_message(self, message: Message) -> None:
-        """Process a robot's presence, status or event. On a new connection, first collect all retained messages."""
+        """Process a robot's presence, status or event.
+
+        On a new connection, first collect all retained messages.
+        """
         if self._retained is not None:
             self._retained.append(message)
             return
@@ -238,7 +251,10 @@ class FleetWatch:
     # -- time limits
 
     def _handle_due(self, now: float) -> None:
-        """Report missing robots, and process complete retained messages. Raises Lost if the broker is away too long."""
+        """Report missing robots, and process complete retained messages.
+
+        Raises Lost if the broker is away too long.
+        """
         if self._retained is not None and self._desk.retained_received:
             self._process_retained(self._retained, now)
         if self._away_since is not None and now - self._away_since >= ABSENCE_LIMIT_S:
@@ -272,7 +288,10 @@ class FleetWatch:
             self._report(event)
 
     def _set_presence(self, name: str, now: Presence | None) -> None:
-        """Store a robot's presence. Report it if the robot or its server has started or stopped."""
+        """Store a robot's presence.
+
+        Report it if the robot or its server has started or stopped.
+        """
         before = self._presences.pop(name, None)
         if now:
             self._presences[name] = now

@@ -40,7 +40,10 @@ class Stopped(Exception):
 
 
 class CannotEnd(Exception):
-    """Raised if a player couldn't be killed. The engine process must exit, because it can't guarantee silence."""
+    """Raised if a player couldn't be killed.
+
+    The engine process must exit, because it can't guarantee silence.
+    """
 
 
 class Player(Protocol):
@@ -106,14 +109,18 @@ class Player(Protocol):
         return None
 
     def close(self) -> None:
-        """Accept no more samples, and let the accepted ones play to the end. Return without waiting.
+        """Accept no more samples, and let the accepted ones play to the end.
+
+        Return without waiting.
 
         Raises:
             CannotSpeak: The accepted samples can't be played to the end.
         """
 
     def ended(self) -> bool:
-        """Return whether the player was closed and has played everything. Raise CannotSpeak if it has failed.
+        """Return whether the player was closed and has played everything.
+
+        Raise CannotSpeak if it has failed.
 
         Raises:
             CannotSpeak: The player failed. This is also raised before `close`, even if no samples are offered.

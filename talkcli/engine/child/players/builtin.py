@@ -89,7 +89,10 @@ class NullPlayer(BuiltInPlayer):
         self._end_time = 0.0
 
     def offer(self, data: memoryview) -> int:
-        """Accept all samples if the simulated buffer has room, otherwise none. Return the number of bytes accepted."""
+        """Accept all samples if the simulated buffer has room, otherwise none.
+
+        Return the number of bytes accepted.
+        """
         now = self._clock()
         end = max(now, self._end_time) + len(data) / self._bytes_per_second
         if end > now + NULL_AHEAD_S:
@@ -181,7 +184,10 @@ class WavStreamPlayer(BuiltInPlayer):
     name = OUTPUT_STREAM_NAME
 
     def __init__(self, output: int, rate: int, *, first: bool) -> None:
-        """Open the player for a descriptor. If this is the `first` sentence, write a header before it."""
+        """Open the player for a descriptor.
+
+        If this is the `first` sentence, write a header before it.
+        """
         super().__init__()
         self._output = output
         self._header = _WAV_HEADER.pack(*_header_fields(rate, _UNKNOWN_BYTES)) if first else b""
@@ -217,7 +223,9 @@ def _convert_os_errors(reason: Reason, subject: str) -> Iterator[None]:
 
 
 def _open_regular_file(path: str) -> int:
-    """Open a file for reading and writing, and return its descriptor. Create the file if it doesn't exist.
+    """Open a file for reading and writing, and return its descriptor.
+
+    Create the file if it doesn't exist.
 
     Raises:
         CannotSpeak: The path is empty, or isn't that of a regular file.

@@ -146,7 +146,9 @@ class PlayerChooser:
         self.handovers.next_waits, self.handovers.next_is_neural = command.next_waits, command.next_is_neural
 
     def update_output(self, player: Player) -> None:
-        """Record the output of a player. If the player was chosen automatically and works, also record its name.
+        """Record the output of a player.
+
+        If the player was chosen automatically and works, also record its name.
 
         A sentence that was ever muted counts as muted.
         """

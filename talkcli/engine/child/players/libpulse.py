@@ -76,7 +76,10 @@ class BufferSizes(Structure):
 
 
 class SinkInfo(Structure):
-    """The first fields of the C structure `pa_sink_info`. Later versions of libpulse only append fields."""
+    """The first fields of the C structure `pa_sink_info`.
+
+    Later versions of libpulse only append fields.
+    """
 
     _fields_ = [
         ("name", c_char_p),

@@ -114,7 +114,9 @@ class PlayerProcess:
             self.exit = io.FileIO(os.pidfd_open(self.pid))
 
     def poll(self) -> int | None:
-        """Return the exit status, or None while the program runs. After its exit, kill all processes that it started.
+        """Return the exit status, or None while the program runs.
+
+        After its exit, kill all processes that it started.
 
         This also reaps the program. If a signal killed it, the status is the negative number of the signal. The program
         counts as running until all processes that it has started have exited.
@@ -151,7 +153,10 @@ class PlayerProcess:
             wait.poll(seconds * 1000)
 
     def release(self) -> None:
-        """Close all descriptors of a program that has been reaped. Calling this again does nothing."""
+        """Close all descriptors of a program that has been reaped.
+
+        Calling this again does nothing.
+        """
         for each in filter(None, (self.stdin, self.stderr, self._leash, self.exit)):
             each.close()
 
@@ -205,12 +210,18 @@ class ErrorOutput:
             self._examine_line(line)
 
     def find_error(self) -> str | None:
-        """Return the first line that looks like an error, or else the first line. Return None if there are no lines."""
+        """Return the first line that looks like an error, or else the first line.
+
+        Return None if there are no lines.
+        """
         self._examine_line(self._lines.take_rest())
         return self._error or self._first
 
     def _examine_line(self, raw: bytes) -> None:
-        """Store a line if it is the first one, or the first that looks like an error. Ignore noise."""
+        """Store a line if it is the first one, or the first that looks like an error.
+
+        Ignore noise.
+        """
         line = raw.decode("utf-8", "replace").strip()
         if not line or re.search(_NOISE, line, re.IGNORECASE):
             return
@@ -253,7 +264,10 @@ class ProgramPlayer(Player):
         self._write(memoryview(command.preamble))
 
     def offer(self, data: memoryview) -> int:
-        """If the program has read all earlier samples, write these. Return the number of bytes written."""
+        """If the program has read all earlier samples, write these.
+
+        Return the number of bytes written.
+        """
         self.ended()  # raises CannotSpeak if the program has exited
         stdin = self._process.stdin
         if stdin.closed:
@@ -278,7 +292,10 @@ class ProgramPlayer(Player):
         self._process.stdin.close()
 
     def ended(self) -> bool:
-        """Return whether the program has played everything and exited. If it has failed, raise CannotSpeak."""
+        """Return whether the program has played everything and exited.
+
+        If it has failed, raise CannotSpeak.
+        """
         status = self._process.poll()
         self._read_stderr()
         if status is None:

@@ -17,12 +17,18 @@ else:
 
 
 class NotInstalled(Exception):
-    """Raised if software that a synthesizer needs is not installed. The message says what to install."""
+    """Raised if software that a synthesizer needs is not installed.
+
+    The message says what to install.
+    """
 
 
 @frozen
 class SpeechSettings:
-    """The settings for speaking a sentence, except the voice. The defaults are those of pyttsx3."""
+    """The settings for speaking a sentence, except the voice.
+
+    The defaults are those of pyttsx3.
+    """
 
     rate: int = 200  # words per minute, 80 to 450
     volume: float = 1.0  # 0.0 to 1.0; 1.0 is the voice's natural volume

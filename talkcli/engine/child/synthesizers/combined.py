@@ -45,7 +45,9 @@ class CombinedSynthesizer:
         self._current, self.voice = current, current.voice
 
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
-        """Speak a text with the current voice. If a neural voice can't be used, speak with libespeak-ng.
+        """Speak a text with the current voice.
+
+        If a neural voice can't be used, speak with libespeak-ng.
 
         The error is raised instead if `settings.voice_only` is set, or if samples have already been written.
         """

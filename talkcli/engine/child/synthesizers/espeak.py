@@ -88,7 +88,9 @@ def _events_of(pointer: Any) -> Iterator[_EspeakEvent]:
 
 
 def load_library() -> tuple[Any, str, int]:
-    """Load and initialize libespeak-ng. Return pyttsx3's binding, the version and the sample rate.
+    """Load and initialize libespeak-ng.
+
+    Return pyttsx3's binding, the version and the sample rate.
 
     The library of the system is preferred. If it is missing, the library from the package espeakng-loader is used. Call
     this once per process, before anything imports `pyttsx3.drivers._espeak`, which also loads the library.
@@ -120,7 +122,10 @@ def load_library() -> tuple[Any, str, int]:
 
 
 def _preload_library() -> tuple[str, bytes | None]:
-    """Load the library before pyttsx3's binding does. Return where it came from, and the directory of its data."""
+    """Load the library before pyttsx3's binding does.
+
+    Return where it came from, and the directory of its data.
+    """
     try:
         ctypes.CDLL(_LIBESPEAK)
         return "system", None
@@ -205,7 +210,10 @@ class Espeak:
         errors: list[BaseException] = []
 
         def on_audio(samples: Any, count: int, events: Any) -> int:
-            """Pass samples and events to the sink. Return 0 to continue the synthesis, or 1 to stop it."""
+            """Pass samples and events to the sink.
+
+            Return 0 to continue the synthesis, or 1 to stop it.
+            """
             if errors:
                 return 1
             try:
@@ -356,7 +364,10 @@ class EspeakPhonemizer:
             raise Stopped
 
     def _speak_silently(self, text: str) -> tuple[list[tuple[int, int]], int]:
-        """Speak a text without output. Return the positions of its words, and the samples in its first clause."""
+        """Speak a text without output.
+
+        Return the positions of its words, and the samples in its first clause.
+        """
         text = guard.guarded(text, self._voice)
         positions: list[tuple[int, int]] = []
         clause_ends: list[int] = []

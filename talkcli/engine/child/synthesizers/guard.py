@@ -86,7 +86,9 @@ _SEPARATE_DIGITS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def guarded(text: str, voice: str = "") -> str:
-    """Replace the characters of a text that would crash libespeak-ng, and return the text. Its length stays the same.
+    """Replace the characters of a text that would crash libespeak-ng, and return the text.
+
+    Its length stays the same.
 
     Args:
         text: The text to make safe.
@@ -154,12 +156,18 @@ def _ends_clause(text: str, start: int, end: int) -> bool:
 
 
 def _is_letter(character: str) -> bool:
-    """Return whether the library counts a character of a word as a letter. Quotes and joiners don't count."""
+    """Return whether the library counts a character of a word as a letter.
+
+    Quotes and joiners don't count.
+    """
     return character.isalnum() or character in _SYMBOL_LETTERS or unicodedata.category(character).startswith("M")
 
 
 def _utf8_bytes(text: str) -> int:
-    """Return the length of a text in UTF-8. A lone surrogate counts as one byte, because it is replaced."""
+    """Return the length of a text in UTF-8.
+
+    A lone surrogate counts as one byte, because it is replaced.
+    """
     return len(text.encode("utf-8", "replace"))
 
 

@@ -165,7 +165,10 @@ class ModelRun:
         self.options.log_severity_level = 4  # Log only fatal errors. Other errors raise exceptions.
 
     def end(self) -> None:
-        """Make the current run and all later ones raise an exception. Any thread may call this."""
+        """Make the current run and all later ones raise an exception.
+
+        Any thread may call this.
+        """
         self.options.terminate = True
 
 
@@ -310,7 +313,9 @@ class Model:
 
 
 def load_libraries(path: str) -> None:
-    """Import numpy and onnxruntime. Error messages name the `path` of the model that needs them.
+    """Import numpy and onnxruntime.
+
+    Error messages name the `path` of the model that needs them.
 
     This takes 0.25 s, and blocks all other threads for a tenth of that time.
 
@@ -380,7 +385,10 @@ def _create_session(model: str | bytes, optimized_path: str | None = None) -> An
 
 
 def _model_error(path: str, problem: str, error: Exception, step: str = "download the voice again") -> VoiceFileError:
-    """Convert an exception of onnxruntime to a VoiceFileError. `step` tells the user what to do next."""
+    """Convert an exception of onnxruntime to a VoiceFileError.
+
+    `step` tells the user what to do next.
+    """
     if _is_out_of_memory(error):
         return no_memory_error(path)
     first_line = (str(error).strip() or type(error).__name__).splitlines()[0]

@@ -96,7 +96,10 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
         return item
 
     def close(self) -> None:
-        """Tell the thread to discard its current item and end, without waiting for it. Call this only once."""
+        """Tell the thread to discard its current item and end, without waiting for it.
+
+        Call this only once.
+        """
         with self._lock:
             self._closed = True
             os.close(self.descriptor)
@@ -142,13 +145,18 @@ class ModelLoader:
         return self._started_at + LOAD_LIMIT_S
 
     def drop(self, voice: str) -> None:
-        """Unload a voice, and forget its error. If the voice is speaking, its memory is freed after the sentence."""
+        """Unload a voice, and forget its error.
+
+        If the voice is speaking, its memory is freed after the sentence.
+        """
         if self._models.pop(voice, None):
             self._unmeasured = ""
         self.errors.pop(voice, None)
 
     def start(self, voice: str) -> None:
-        """Load a voice in the background. If it is already loaded, add a `VoiceLoaded` event at once.
+        """Load a voice in the background.
+
+        If it is already loaded, add a `VoiceLoaded` event at once.
 
         When the load begins, any earlier error of the voice is forgotten.
         """
@@ -160,7 +168,9 @@ class ModelLoader:
             self._start_next_load()
 
     def get_model(self, voice: str) -> Model | None:
-        """Return the model of a voice, or None if it isn't loaded. Unload a failed voice whose files have changed.
+        """Return the model of a voice, or None if it isn't loaded.
+
+        Unload a failed voice whose files have changed.
 
         If the thread of a load is done, finish the load first.
         """
@@ -173,7 +183,10 @@ class ModelLoader:
         return model
 
     def mark_spoken(self, voice: str) -> None:
-        """Schedule a memory measurement. The first sentences with a voice need memory that is never freed."""
+        """Schedule a memory measurement.
+
+        The first sentences with a voice need memory that is never freed.
+        """
         if voice not in self._models:
             self._unmeasured = ""  # The voice was unloaded during the sentence, and its memory has been freed just now.
         elif self._unmeasured is None:
@@ -276,7 +289,10 @@ def _open_cache() -> ModelCache | None:
 
 
 def _read_private_bytes() -> int | None:
-    """Return how much private memory this process uses, including swap. Return None if a sandbox hides it."""
+    """Return how much private memory this process uses, including swap.
+
+    Return None if a sandbox hides it.
+    """
     try:
         with open("/proc/self/status", "rb") as file:
             fields = dict(line.split(b":", 1) for line in file)

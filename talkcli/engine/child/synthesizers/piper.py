@@ -154,7 +154,9 @@ class Piper:
             raise CannotSpeak(Reason.VOICE_FAILED, words) from error
 
     def _wait_for_model(self, voice: str, sink: SampleSink) -> Model:
-        """Return the model of a voice, after loading it if necessary. The sink keeps playing meanwhile.
+        """Return the model of a voice, after loading it if necessary.
+
+        The sink keeps playing meanwhile.
 
         Raises:
             CannotSpeak: The voice can't be loaded.
@@ -272,7 +274,9 @@ def _to_bytes(samples: Any, volume: float) -> bytes:
 
 
 def _phoneme_ids(phonemes: Sequence[str], ids: Mapping[str, tuple[int, ...]]) -> tuple[list[int], list[int]]:
-    """Convert phonemes to the model's ids. Also return the index of each phoneme's first id.
+    """Convert phonemes to the model's ids.
+
+    Also return the index of each phoneme's first id.
 
     If the model doesn't know a phoneme, it gets the index of the next known phoneme, or of the end. If the model knows
     none of them, the list of indexes is empty.

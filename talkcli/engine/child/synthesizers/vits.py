@@ -55,7 +55,10 @@ _MAX_NAME_BYTES = 1000
 
 
 class NotSplit(Exception):
-    """Raised if a model is unsafe or isn't one of Piper's. The message gives the reason without the file's name."""
+    """Raised if a model is unsafe or isn't one of Piper's.
+
+    The message gives the reason without the file's name.
+    """
 
 
 def split_model(model: Buffer) -> tuple[ModelHalf, ModelHalf]:
