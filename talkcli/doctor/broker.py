@@ -1,4 +1,4 @@
-"""The checks of a fleet's broker, and of one robot that is connected to it.
+"""Checks of an MQTT broker and one of its robots.
 
 The checks use the rights of an operator, or those of the robot's bridge if the login is the robot's name. They have no
 side effects, because the broker doesn't retain the test messages, and bridges ignore them.
@@ -43,10 +43,9 @@ _Result = TypeVar("_Result")
 #: Time limit for each check. It is longer than `LOGIN_LIMIT_S`, because looking up the broker's host name also takes
 #: time.
 _STEP_LIMIT_S = 2 * LOGIN_LIMIT_S
-#: How long to wait for a test message, and for the presence of robots, after the broker has acknowledged all messages.
+#: How long to wait for test messages and presence messages after the broker has acknowledged everything.
 _RETURN_LIMIT_S = 1.0
-#: Payload of the test message that the broker should send back. Bridges use another payload for their own test
-#: messages.
+#: Payload of the doctor's test message. Bridges use another payload for theirs.
 _ECHO_PAYLOAD = b"doctor"
 #: A warning is shown if the certificate expires within this time.
 _RENEWAL_LIMIT_S = 14 * 86400
@@ -58,7 +57,7 @@ _UNREACHABLE_STEPS = {
     "no such host": "correct the host in TALK_BROKER, and check it: getent hosts {host}",
     _NO_ANSWER: "check that {host} is up and that no firewall blocks it: ping {host}",
 }
-#: OpenSSL's error codes for a certificate with an invalid date, and for a certificate of another host.
+#: OpenSSL's error codes for a certificate with an invalid date or the wrong host name.
 _DATE_CODES, _HOST_CODES = (9, 10), (62, 64)
 _LOG_STEP = "read the broker's log: journalctl -u mosquitto"
 
@@ -135,7 +134,7 @@ class BrokerExamination:
             yield self._ask_robot(broker)
 
     def _check_connection(self, broker: Broker, context: ssl.SSLContext | None) -> Iterator[Finding]:
-        """Connect to the broker without logging in, and yield the findings about the connection and the certificate."""
+        """Check the connection to the broker and the broker's certificate."""
         began = time.monotonic()
         try:
             connection = self._wait_for(partial(socket.create_connection, (broker.host, broker.port), LOGIN_LIMIT_S))
@@ -156,7 +155,7 @@ class BrokerExamination:
             yield judge_certificate(broker, expires_at, time.time())
 
     def _log_in(self, broker: Broker) -> Link:
-        """Connect to the broker, log in, and return the connection.
+        """Log in to the broker, and return the connection.
 
         Raises the same errors as `Link.open`.
         """
@@ -169,9 +168,9 @@ class BrokerExamination:
         return link
 
     def _check_anonymous(self, broker: Broker) -> Finding:
-        """Try to log in without credentials, and return the finding.
+        """Try to log in without credentials.
 
-        It is a warning if the broker allows this.
+        The finding is a warning if the broker allows this.
         """
         try:
             self._log_in(replace(broker, user=None, password=None, cert=None, key=None)).close()
@@ -181,7 +180,7 @@ class BrokerExamination:
         return warning("anonymous", words, "allow_anonymous false in mosquitto.conf; then: talk bridge --print-acl")
 
     def _test_rights(self, link: Link, user: str) -> tuple[Finding, dict[str, Presence]]:
-        """Publish messages to test the user's rights.
+        """Test the user's access rights by publishing messages.
 
         Return the finding, and the presences of robots by name.
 
@@ -225,7 +224,7 @@ class BrokerExamination:
         return judge_rights(user, unwritable, unreadable, trouble), presences
 
     def _ask_robot(self, broker: Broker) -> Finding:
-        """Request the status of the robot's server, and return the finding about the answer."""
+        """Check whether the robot's server answers a status request."""
         end = time.monotonic() + _STEP_LIMIT_S
         try:
             connection = connect_robot(
@@ -241,7 +240,7 @@ class BrokerExamination:
             return failure("bridge", wrong, remedy or step)
 
     def _wait_for(self, function: Callable[[], _Result]) -> _Result:
-        """Run a blocking function in a thread with a time limit, and return its result.
+        """Run a blocking function in a thread with a time limit.
 
         Raises:
             TimeoutError: The work takes too long. The thread continues, but its result is ignored.
@@ -265,13 +264,13 @@ class BrokerExamination:
 
 
 def _read_expiry(connection: socket.socket, context: ssl.SSLContext, host: str) -> float:
-    """Start TLS on a connection, and return the expiry time of the broker's certificate in seconds since 1970."""
+    """Start TLS, and return when the broker's certificate expires, in seconds since 1970."""
     with context.wrap_socket(connection, server_hostname=host) as secured:
         return ssl.cert_time_to_seconds(str((secured.getpeercert() or {})["notAfter"]))
 
 
 def _explain_error(error: OSError | UnicodeError) -> str:
-    """Return a short text that says why a connection to the broker failed."""
+    """Describe briefly why a connection to the broker failed."""
     if isinstance(error, ssl.SSLCertVerificationError):
         return error.verify_message
     if isinstance(error, ssl.SSLError):
@@ -381,7 +380,7 @@ def judge_login(broker: Broker, refusal: str | None) -> Finding:
 
 
 def judge_presence(presence: Presence, now: float) -> Finding:
-    """Return the finding about whether the robot is online and has a server, from its presence message."""
+    """Return the finding about a robot's presence message."""
     robot = presence.name
     if not presence.online:
         step = f"check its network and power; on {robot}, run: systemctl status talk-bridge"
@@ -399,7 +398,7 @@ def judge_presence(presence: Presence, now: float) -> Finding:
 
 
 def judge_unknown_robot(robot: str, known_robots: list[str], user: str, *, has_rights: bool) -> Finding:
-    """Return the finding about a robot for which the broker sends no presence message.
+    """Return the finding about a robot without a presence message.
 
     Args:
         robot: the robot's name.
@@ -422,7 +421,7 @@ def judge_unknown_robot(robot: str, known_robots: list[str], user: str, *, has_r
 
 
 def judge_rights(user: str, unwritable: tuple[str, ...], unreadable: tuple[str, ...], error: str | None) -> Finding:
-    """Return the finding about the user's access rights, as shown by test messages.
+    """Return the finding about the user's access rights.
 
     Args:
         user: the user's name.
@@ -442,7 +441,7 @@ def judge_rights(user: str, unwritable: tuple[str, ...], unreadable: tuple[str, 
 
 
 def judge_server_status(robot: str, server: JsonObject, answer_s: float) -> Finding:
-    """Return the finding about the status that the robot's server sent within `answer_s` seconds."""
+    """Return the finding about the status of the robot's server."""
     words = f"{robot} answered in {answer_s * 1000:.0f} ms: {summarize_server(server)}"
     if server.get("paused") is True:
         return warning("bridge", f"speech is paused; {words}", f"talk --robot {robot} resume")

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import Goal
 
 _SENTENCE_CHECK = "sentence"
-#: The sentence that is played silently beside a running server. It is short and fast, because some devices accept only
-#: one player at a time, but long enough to show whether the player works.
+#: The sentence to play silently beside a running server. It is short, because some devices accept only one player at a
+#: time, but long enough to show whether the player works.
 SILENT_TEXT, _SILENT_RATE_WPM = "talk works well", 450
 #: Advice for each reason why a goal can end. The reasons "late" and "paused" are only used by the doctor. A test checks
 #: that no reason for aborting a goal is missing.
@@ -113,7 +113,7 @@ def speak_by_server(client: Client, text: str, limit: float) -> SentenceResult:
 
 
 def _cancel_late_goal(client: Client, goal: GoalHandle, limit: float) -> SentenceResult:
-    """Cancel a goal that took longer than `limit` seconds, and return a result that explains the delay."""
+    """Cancel a goal that took too long, and explain the delay."""
     before = client.status()
     ended = goal.cancel()
     if ended.state in {State.SUCCEEDED, State.ABORTED}:  # it ended before it could be cancelled
@@ -185,7 +185,7 @@ def find_playback_step(findings: Sequence[Finding], *, custom: bool = False) -> 
 def advise(
     reason: str | None, message: str | None, player: object = None, device: object = None, text: str | None = None
 ) -> str:
-    """Return what the user should do next if a goal ended for this reason.
+    """Return advice for a goal that ended for this reason.
 
     Args:
         reason: the goal's reason.

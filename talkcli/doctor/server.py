@@ -33,15 +33,14 @@ if TYPE_CHECKING:
 
 #: The name under which the doctor connects to the server.
 DOCTOR_NAME = "talk doctor"
-#: The beginning of a client's error message that only lists the places where no server was found.
+#: How a client's error message begins if no server was found.
 _NO_SERVER_PREFIX = "no server"
 #: Number of recently ended goals to check for failures.
 _LOG_GOALS_COUNT = 100
 _RECENT_CHECK = "recent goals"
 #: How long to wait for a starting engine, and how often to ask for its state.
 _ENGINE_START_LIMIT_S, _ENGINE_POLL_S = 1.0, 0.05
-#: Descriptions of paths to which a client can connect. The kernel accepts connections even if the process never
-#: answers. `paths` describes failed connections.
+#: Descriptions of paths that accept connections. The kernel accepts them even if the process never answers.
 PLACE_FOREIGN = "another user's server"
 PLACE_LISTENING = "a process is listening"
 PLACE_STOPPED = "a stopped process is listening"
@@ -71,7 +70,7 @@ _FAINT_VOLUME = 0.2
 
 @frozen
 class SocketPlace:
-    """A path where a server may listen, and what is there."""
+    """What was found at a path where a server may listen."""
 
     path: str
     #: what is there: one of the PLACE texts, or the system's error message
@@ -108,7 +107,7 @@ def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Cl
 
 
 def _find_refusal(error: TalkError, places: list[SocketPlace]) -> str | None:
-    """Return the line of an error message that says why a process refused the client, or None."""
+    """Find the line of an error message that says why the client was refused."""
     lines = error.message.splitlines()
     if not lines[0].startswith(_NO_SERVER_PREFIX):
         return lines[0]
@@ -117,7 +116,7 @@ def _find_refusal(error: TalkError, places: list[SocketPlace]) -> str | None:
 
 
 def _probe_path(path: str, trusted: Container[str | None]) -> SocketPlace:
-    """Connect to a path, disconnect at once, and return what is there."""
+    """Find out what is at a path by connecting to it."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
@@ -136,7 +135,7 @@ def _probe_path(path: str, trusted: Container[str | None]) -> SocketPlace:
 
 
 def request_status_and_log(client: Client) -> tuple[JsonObject, list[Goal]]:
-    """Request and return a server's status and its recently ended goals, oldest first.
+    """Return a server's status and its recently ended goals, oldest first.
 
     If the server has just started, wait a moment until its engine has reported the player.
     """
@@ -161,7 +160,7 @@ def local_pid(client: Client) -> int | None:
 
 
 def judge_found_server(message: str, earlier_places: list[SocketPlace]) -> Finding:
-    """Return the finding about the server's socket, and about anything at the places that clients try first.
+    """Return the finding about the socket of the server that was found.
 
     Args:
         message: the description of the server's socket.
@@ -225,7 +224,7 @@ def _advise_on_missing_server(places: list[SocketPlace], named_by: str | None, c
 
 
 def judge_unresponsive_server(message: str) -> Finding:
-    """Return the finding about a server that accepted the connection, but didn't answer."""
+    """Return the finding about a server that accepted the connection but didn't answer."""
     return failure("server", message, "read its log, and restart it: talk serve")
 
 
@@ -241,7 +240,7 @@ def judge_server(server: JsonObject, log: Sequence[Goal], now: float) -> list[Fi
 
 
 def _judge_state(server: JsonObject) -> Finding:
-    """Return the finding about a server's state: whether it is paused, its engine and its version."""
+    """Return the finding about a server's state."""
     version, words = server.get("version"), summarize_server(server)
     if server.get("paused") is True:
         return failure("server", f"speech is paused; {words}", "talk resume")

@@ -58,7 +58,7 @@ _FAINT_PERCENT = 20
 _ALSA_CONTROLS = ("Master", "PCM", "Speaker", "Headphone", "Digital")
 #: The human-readable name of a sound server's output.
 _DEFAULT_SINK = "the default sink"
-#: The commands of each mixer program that unmute the default sink and make it louder.
+#: For each mixer program, the commands that unmute the default sink and raise its volume.
 _PACTL_COMMANDS = ("pactl set-sink-mute @DEFAULT_SINK@ 0", "pactl set-sink-volume @DEFAULT_SINK@ 70%")
 _WPCTL_COMMANDS = ("wpctl set-mute @DEFAULT_AUDIO_SINK@ 0", "wpctl set-volume @DEFAULT_AUDIO_SINK@ 0.7")
 #: Time limit for a program. Programs answer within milliseconds, unless the sound server hangs.
@@ -69,7 +69,7 @@ _MAX_OUTPUT_BYTES = 64 * 1024
 
 @frozen
 class UserSession:
-    """The user and session of the server's process or of this process."""
+    """The user and session of a process."""
 
     uid: int
     user: str
@@ -91,7 +91,7 @@ class UserSession:
 
 @frozen
 class ProgramOutput:
-    """A program's output, and the reason if it failed."""
+    """A program's output, with the reason if it failed."""
 
     #: why the program failed, or None if it succeeded
     error: str | None
@@ -101,7 +101,7 @@ class ProgramOutput:
 
 @frozen
 class SoundServer:
-    """Facts about the sound server, which is PulseAudio or PipeWire."""
+    """Facts about the sound server (PulseAudio or PipeWire)."""
 
     #: name such as "PulseAudio (on PipeWire 0.3.65)", or None if no sound server answers
     name: str | None = None
@@ -120,7 +120,7 @@ class SoundServer:
 
 
 def find_session(server_pid: int | None) -> tuple[UserSession, Mapping[str, str]]:
-    """Return the session and environment of the process whose player makes the sound.
+    """Return the session and environment of the process that plays the sound.
 
     This is the server, or this process if there is no server or its environment can't be read.
     """
@@ -191,7 +191,7 @@ def _group_ids(pid: int) -> tuple[int, ...]:
 
 
 def _find_origins(environment: Mapping[str, str], pid: int) -> Iterable[str]:
-    """Yield descriptions of what started a process, with the most specific one first."""
+    """Yield descriptions of what started a process, most specific first."""
     if environment.get("container") or any(map(os.path.exists, _CONTAINER_FILES)):
         yield _CONTAINER
     unit = re.search(r"system\.slice/(?:[^\n]*/)?([^/\n]+)\.service", _read_proc_text(f"/proc/{pid}/cgroup"))
@@ -245,7 +245,7 @@ def _read_proc_text(path: str) -> str:
 
 
 def run_program(program: str, *arguments: str, env: Mapping[str, str], limit: float | None = None) -> ProgramOutput:
-    """Run a program in the C locale, and return its output. Kill it after `limit` seconds.
+    """Run a program in the C locale with a time limit, and return its output.
 
     The default limit is PROGRAM_LIMIT_S.
     """
@@ -267,7 +267,7 @@ def run_program(program: str, *arguments: str, env: Mapping[str, str], limit: fl
             process.wait(limit)
         code = process.returncode
         if code is None:
-            kill([-process.pid])  # the process group, whose id can't be reused before the process is reaped
+            kill([-process.pid])  # the group's id stays valid until the process is reaped
             with contextlib.suppress(subprocess.TimeoutExpired):  # it hangs in a driver, so init will reap it
                 process.wait(1)
         stdout, stderr = (os.pread(each.fileno(), _MAX_OUTPUT_BYTES, 0).decode(errors="replace") for each in (out, err))
@@ -280,7 +280,7 @@ def run_program(program: str, *arguments: str, env: Mapping[str, str], limit: fl
 
 
 def is_custom(player: str | None) -> bool:
-    """Return whether a player is a command that the user wrote, not one of the known players."""
+    """Return whether a player is a command that the user wrote."""
     program = _program_of(player) if player and not is_silent(player) else None
     return program is not None and program.rpartition("/")[2] not in PLAYERS
 
@@ -299,12 +299,12 @@ def installed_players(env: Mapping[str, str]) -> list[str]:
 
 
 def _parse_alsa_devices(output: ProgramOutput) -> list[str]:
-    """Return the names in the device list of `aplay -L`, without ALSA's plugins and converters."""
+    """Return the devices listed by `aplay -L`, except plugins and converters."""
     return [each for each in output.stdout.splitlines() if each and not each[0].isspace() and each not in _NOT_DEVICES]
 
 
 def _parse_pulse_sinks(output: ProgramOutput) -> dict[str, str]:
-    """Parse the list of sinks printed by pactl, and return the state of each sink by name.
+    """Return the state of each sink in pactl's list, by name.
 
     A line has the sink's number, name, module, format and state, separated by tabs.
     """
@@ -330,23 +330,20 @@ DEVICE_LISTS: dict[str, tuple[str, Callable[[ProgramOutput], Iterable[str]], str
 
 
 def add_pactl_hint(finding: Finding, env: Mapping[str, str]) -> Finding:
-    """Return a finding.
-
-    If its advice uses pactl and pactl is missing, add a hint on how to install pactl.
-    """
+    """Add a hint on how to install pactl if a finding's advice needs it and it is missing."""
     if finding.next is None or "pactl " not in finding.next or on_path("pactl", env):
         return finding
     return replace(finding, next=f"{finding.next} (to install pactl: sudo apt-get install -y {PACKAGES['pacat']})")
 
 
 def suspended_sinks(env: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the names of suspended sinks, including sinks that are only suspended because nothing is playing."""
+    """Return the names of suspended sinks, including idle ones."""
     sinks = _parse_pulse_sinks(run_program(*_LIST_SINKS.split(), env=env))
     return tuple(name for name, state in sinks.items() if state == "SUSPENDED")
 
 
 def find_sound_server(env: Mapping[str, str], session: UserSession) -> SoundServer:
-    """Return facts about the sound server that this session's players connect to, or why none answers."""
+    """Find the sound server that the session's players connect to."""
     pulse = run_program("pactl", "info", env=env)
     if pulse.error is None:
         fields = dict(re.findall(r"^\s*([\w ]+): (.*\S)", pulse.stdout, re.MULTILINE))
@@ -383,7 +380,7 @@ def _find_pulse_address(env: Mapping[str, str]) -> str | None:
 
 
 def check_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[str], *, is_used: bool) -> list[Finding]:
-    """Return the findings about the volume of the default sink, or of the sound cards if there is no sound server.
+    """Check the volume of the default sink or, without a sound server, of the sound cards.
 
     Args:
         env: the environment of the player.
@@ -399,7 +396,7 @@ def check_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[st
 
 
 def _read_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[str]) -> Iterable[tuple[str, ...]]:
-    """Run mixer programs, and yield the first four arguments of `judge_level` for each output."""
+    """Run mixer programs, and yield arguments of `judge_level` for each output."""
     if server.name is not None:
         mute = run_program("pactl", "get-sink-mute", "@DEFAULT_SINK@", env=env)
         if mute.error is None:
@@ -447,7 +444,7 @@ def judge_level(name: str, text: str, unmute_command: str, louder_command: str, 
 
 
 def judge_session(session: UserSession) -> Finding:
-    """Return the finding about the session, which shows whether players can find the user's sound server."""
+    """Return the finding about the user session."""
     who = "" if session.server_pid is None else "the server runs as "
     who += f"user {session.user} (uid {session.uid})"
     who += "" if session.sudo_uid is None else f" through sudo by uid {session.sudo_uid}"
@@ -481,12 +478,12 @@ def judge_silent_player(player: str | None, *, by_server: bool) -> Finding:
 
 
 def _describe_player_setting(by_server: bool) -> str:
-    """Describe whether the server or TALK_PLAYER configured the player."""
+    """Describe where the player was configured."""
     return "set by the server" if by_server else "set by TALK_PLAYER"
 
 
 def check_player(env: Mapping[str, str], configured: str | None, used: str | None, *, by_server: bool) -> Finding:
-    """Check whether the player is installed, and return the finding.
+    """Check whether the player is installed.
 
     Args:
         env: the environment of the player.
@@ -513,7 +510,7 @@ def check_player(env: Mapping[str, str], configured: str | None, used: str | Non
 
 
 def check_device(env: Mapping[str, str], player: str, configured: str | None) -> Finding:
-    """List the player's devices, and return the finding about whether the configured one is among them.
+    """Check whether the configured device is one of the player's devices.
 
     Args:
         env: the environment of the player.
@@ -544,7 +541,7 @@ def check_device(env: Mapping[str, str], player: str, configured: str | None) ->
 
 
 def check_cards(cards: Sequence[str], server: SoundServer, session: UserSession) -> Finding:
-    """Return the finding about whether the kernel has found sound cards."""
+    """Check whether the kernel has found any sound cards."""
     if cards:
         return ok("cards", join_names(cards))
     if server.name is not None:
@@ -558,7 +555,7 @@ def check_cards(cards: Sequence[str], server: SoundServer, session: UserSession)
 
 
 def check_access(server: SoundServer, session: UserSession, directory: str = "/dev/snd") -> Finding:
-    """Check whether the user may open the sound cards, and return the finding."""
+    """Check whether the user may open the sound cards."""
     nodes, group, forbidden = players.playback_devices(directory), _AUDIO_GROUP, []
     for each in nodes:
         with contextlib.suppress(OSError):
@@ -583,7 +580,7 @@ def check_access(server: SoundServer, session: UserSession, directory: str = "/d
 
 
 def judge_sound_server(server: SoundServer, cards: Sequence[str], session: UserSession) -> Finding:
-    """Return the finding about the sound server, which shows whether players can use it."""
+    """Return the finding about the sound server."""
     check = _SOUND_SERVER_CHECK
     where = "from here" if session.server_pid is None else f"from the server (process {session.server_pid})"
     if server.name is not None and server.sink == DUMMY_SINK:
@@ -607,7 +604,7 @@ def judge_sound_server(server: SoundServer, cards: Sequence[str], session: UserS
 
 
 def _judge_unreachable(server: SoundServer, session: UserSession, message: str) -> Finding:
-    """Return a warning that the sound server can't be reached, with advice for the most likely cause."""
+    """Return a warning that the sound server can't be reached."""
     hint, step = "", "systemctl --user restart pipewire pipewire-pulse (or: pulseaudio --start)"
     if server.pulse_server is not None:
         step = "unset PULSE_SERVER, or start the sound server that it names"

@@ -119,7 +119,7 @@ def installed_version(package: str) -> str | None:
 
 
 def start_engine(options: EngineOptions, limit: float = math.inf, output: int | None = None) -> PrivateEngine:
-    """Start an engine process, and return it.
+    """Start an engine process.
 
     Args:
         options: the options of the engine.
@@ -136,7 +136,7 @@ def start_engine(options: EngineOptions, limit: float = math.inf, output: int | 
 
 
 def probe_engine(options: EngineOptions) -> EngineReport:
-    """Start an engine process, end it, and return what it reported."""
+    """Start and end an engine process, and return its report."""
     ready = None
     try:
         with start_engine(options) as engine:
@@ -208,7 +208,7 @@ def _judge_library(library_version: str | None, voices: tuple[str, ...] | None) 
 def check_neural(
     used: str | None, options: EngineOptions, limit: float, server_voices: dict[str, Any] | None
 ) -> Iterator[Finding]:
-    """Check the packages and files of neural voices, try the voice in use, and yield the findings.
+    """Check the installation of neural voices, and try the voice in use.
 
     Args:
         used: the voice in use, as the user wrote it, or None if no neural voice is in use.
@@ -229,7 +229,7 @@ def check_neural(
 
 
 def _check_voice_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
-    """Check the files of all installed neural voices, and yield a finding if there are any."""
+    """Check the files of all installed neural voices."""
     valid, invalid = [], []
     for name, path in models.find_models(env).items():
         try:
@@ -274,7 +274,7 @@ def _with_version(package: str) -> str:
 
 
 def _split_advice(message: str) -> tuple[str, str]:
-    """Split an error message into the fault and the advice, which follows the last semicolon.
+    """Split an error message into the fault and the advice.
 
     The default advice is to choose another voice.
     """
@@ -283,7 +283,7 @@ def _split_advice(message: str) -> tuple[str, str]:
 
 
 def _try_voice(voice: str, options: EngineOptions, limit: float) -> VoiceTrial:
-    """Load a voice, and return how fast it speaks a sentence, or why it failed.
+    """Load a voice, and measure how fast it speaks.
 
     Nothing is played.
     """
@@ -327,7 +327,7 @@ def _memory_of(pid: int) -> int | None:
 
 
 def judge_server_voices(voices: dict[str, Any]) -> list[Finding]:
-    """Return the findings about the neural voices of a server whose files can't be examined.
+    """Return the findings about the server's neural voices, without examining files.
 
     `voices` is the server's description of its neural voices.
     """
@@ -339,7 +339,7 @@ def judge_server_voices(voices: dict[str, Any]) -> list[Finding]:
 
 
 def judge_trial(used: str, trial: VoiceTrial, server_voices: dict[str, Any] | None) -> Finding:
-    """Return the finding about trying the neural voice in use.
+    """Return the finding about the trial of a neural voice.
 
     The other arguments are those of `check_neural`.
     """

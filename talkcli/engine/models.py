@@ -103,7 +103,7 @@ def find_models(environment: Mapping[str, str] | None = None) -> dict[str, str]:
 
 
 def installed_voices() -> tuple[Voice, ...]:
-    """Return all installed neural voices, with the details from their descriptions if these can be read."""
+    """Return all installed neural voices, with details if their descriptions can be read."""
     return tuple(_describe_voice(name, path) for name, path in find_models().items())
 
 
@@ -113,7 +113,7 @@ def undescribed_voices(environment: Mapping[str, str] | None = None) -> tuple[Vo
 
 
 def read_description(path: str) -> VoiceDescription:
-    """Read and return the description of a voice from the JSON file beside its model.
+    """Read the description of a voice from the JSON file beside its model.
 
     Raises:
         VoiceFileError: The file is missing, unsafe or invalid.
@@ -157,7 +157,7 @@ def open_checked(path: str, missing: str = "restore it", model: str = "") -> Any
 
 
 def _require_safe_paths(*paths: str) -> None:
-    """Raise VoiceFileError if another user could replace these files, or a directory or link in their paths.
+    """Raise VoiceFileError if another user could replace these files.
 
     In a sticky directory such as /tmp, only the owner of an entry can replace it. Everyone may write to such a
     directory, but it must not directly contain a voice file or a link to one.
@@ -180,7 +180,7 @@ def _require_safe_paths(*paths: str) -> None:
 
 
 def _walk_path(path: str) -> Iterator[tuple[str, bool]]:
-    """Yield each directory in a file's path and then the file, following symbolic links.
+    """Yield each directory in a file's path, and then the file itself.
 
     Each path comes with a flag, which is True if another directory follows.
 
@@ -210,7 +210,7 @@ def _walk_path(path: str) -> Iterator[tuple[str, bool]]:
 
 
 def _others_can_write(path: str, status: os.stat_result) -> bool:
-    """Return whether a file's mode or access control list lets anyone except root and this user write to it."""
+    """Return whether anyone except root and this user may write to a file."""
     if status.st_mode & stat.S_IWOTH:
         return True
     if not status.st_mode & stat.S_IWGRP:
@@ -226,7 +226,7 @@ def _require_safe_owner(path: str, status: os.stat_result) -> None:
 
 
 def _has_acl(path: str) -> bool:
-    """Return whether a file may have an access control list, which can allow more users to write to it."""
+    """Return whether a file may have an access control list."""
     try:
         return hasattr(os, "listxattr") and "system.posix_acl_access" in os.listxattr(path)
     except OSError as error:
@@ -234,7 +234,7 @@ def _has_acl(path: str) -> bool:
 
 
 def _is_private_group(user: int, group: int) -> bool:
-    """Return whether a group has this user as its only member, like the groups that Debian creates for each user."""
+    """Return whether this user is the only member of a group."""
     import grp
     import pwd
 
@@ -277,7 +277,7 @@ def _list_entries(directory: str, suffix: str) -> list[str]:
 
 
 def _describe_voice(name: str, path: str) -> Voice:
-    """Return the voice of a model, with the details from its description if it can be read."""
+    """Return the voice of a model, with details if its description can be read."""
     try:
         found = read_description(path)
     except VoiceFileError:
@@ -330,7 +330,7 @@ def _parse_description(content: Any) -> VoiceDescription:
 
 
 def _shorten(value: object) -> str:
-    """Return a value as text, which is cut off if it is too long to be shown to users."""
+    """Convert a value to text, and cut off long text."""
     words = str(value)
     return words if len(words) <= _MAX_SHOWN_CHARS else f"{words[:_MAX_SHOWN_CHARS]}…"
 

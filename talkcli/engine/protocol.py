@@ -141,7 +141,7 @@ class Continue:
 
 @frozen
 class NextGoal:
-    """The command that says whether another goal waits behind the current one, and whether it needs a neural voice."""
+    """The command that describes the next goal in the queue."""
 
     id: str  # ID of the current goal
     next_waits: bool  # whether another goal is waiting in the queue
@@ -176,8 +176,8 @@ class Voice:
     language: str | None
     name: str
     quality: str | None = None  # quality level of a neural voice, such as "medium"
-    #: speakers of a neural voice, in the order of their numbers. In messages, this is None, because pyttsx3's list of
-    #: voices has no field for speakers.
+    #: speakers of a neural voice, sorted by number. In messages, this is None, because pyttsx3's list of voices has no
+    #: field for speakers.
     speakers: tuple[str, ...] | None = None
 
 

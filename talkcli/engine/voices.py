@@ -95,7 +95,7 @@ def matching_languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
 
 
 def _matching_voices(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> dict[str, Voice]:
-    """Return the voices that a name may refer to, with their unambiguous names as keys."""
+    """Return the voices that a name may refer to, by unambiguous name."""
     for words in _possible_names(wanted, voices):
         fitting: dict[Voice, str] = {}
         for word in words:
@@ -108,7 +108,7 @@ def _matching_voices(wanted: str, voices: tuple[Voice, ...], preferred: str | No
 
 
 def _possible_names(wanted: str, voices: tuple[Voice, ...]) -> Iterator[list[str]]:
-    """Yield lists of names to try, most likely first: the name that the user typed, and then similar names."""
+    """Yield lists of names to try, most likely first."""
     yield [wanted]
     name, mark, speaker = wanted.partition(SPEAKER_MARK)
     word = _fold(name)
@@ -247,7 +247,7 @@ def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], foreign_driver
 
 
 def _suggestions(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
-    """Return known names that are similar to an unknown name, in the form that a user types."""
+    """Suggest known names that are similar to an unknown name."""
     plain, variants = _split_variants(voices)
     neural = [each for each in voices if is_neural(each.id)]
     if is_neural(wanted):
@@ -271,7 +271,7 @@ def _suggestions(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
 
 
 def _split_variants(voices: Sequence[Voice]) -> tuple[list[Voice], list[Voice]]:
-    """Return two lists: the voices of libespeak-ng or another driver, and the variants.
+    """Split a list of voices into voices and variants.
 
     Omit neural voices.
     """

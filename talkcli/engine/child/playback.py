@@ -1,4 +1,4 @@
-"""Playback of one sentence, including pauses and a check that all of it was heard.
+"""Playback of one sentence, including pauses.
 
 `Playback` waits only in `GoalRunner.wait`, so that a `Stop` or a `Hold` can arrive at any time. `SentenceSamples` and
 `PlayerFeed` never wait. Nothing here depends on how the samples are synthesized or which kind of player plays them.
@@ -104,7 +104,7 @@ class SentenceSamples:
         return self.begin + len(self._kept)
 
     def add(self, samples: bytes) -> None:
-        """Append samples, and update `audible` and the length of the silence at the end."""
+        """Append samples to the buffer."""
         self._kept += samples
         self.audible = self.audible or samples.count(0) != len(samples)
         backwards = reversed(array("h", samples))
@@ -112,7 +112,7 @@ class SentenceSamples:
         self._quiet = self._quiet + len(samples) if quiet_count is None else quiet_count * SAMPLE_BYTES
 
     def leading_zeros(self) -> int:
-        """Return the length in bytes of the zero samples at the beginning of the buffer."""
+        """Return how many bytes of zeros the buffer begins with."""
         return (len(self._kept) - len(self._kept.lstrip(b"\0"))) // SAMPLE_BYTES * SAMPLE_BYTES
 
     def part(self, begin: int, end: int) -> memoryview:
@@ -128,15 +128,15 @@ class SentenceSamples:
         self.begin = offset
 
     def trailing_silence(self, limit: int) -> int:
-        """Return the length in bytes of the silence at the end of the buffer, at most `limit`."""
+        """Return how many bytes of silence the buffer ends with, at most `limit`."""
         return min(self._quiet, limit, len(self._kept))
 
 
 class PlayerFeed:
-    """Sends samples to one player, and adjusts the clock for word reports to the player's progress."""
+    """Sends samples to one player, and keeps the word clock in step with it."""
 
     def __init__(self, player: Player, rate: int, clock: WordClock, begin: float, lead_in: float) -> None:
-        """Start a stream, and reset the clock for it.
+        """Start a stream, and reset the word clock.
 
         Args:
             player: the player, which was just opened.
@@ -148,7 +148,7 @@ class PlayerFeed:
         self.player = player
         #: maximum number of bytes to offer at once
         self.piece_bytes = int(PIECE_S * rate) * SAMPLE_BYTES
-        #: number of bytes that the player had consumed at the last update, including silence
+        #: number of bytes consumed at the last update, including silence
         self.consumed = 0
         #: number of bytes written to the player, including silence
         self.written = 0
@@ -159,7 +159,7 @@ class PlayerFeed:
         self._first_write_at = 0.0
         #: time at which everything written will have been heard
         self._heard_at = 0.0
-        #: number of bytes of silence still to be written before the first sample
+        #: bytes of silence to write before the first sample
         self.lead_in = int(lead_in * rate) * SAMPLE_BYTES if player.real_time else 0
         clock.reset(begin)
 
@@ -180,7 +180,7 @@ class PlayerFeed:
         return taken
 
     def offer_silence(self, position: float, limit: int | None = None) -> int:
-        """Offer silence to the player, record it in the clock, and return the number of bytes accepted.
+        """Offer silence to the player, and return the number of bytes accepted.
 
         Args:
             position: position in the audio of the next sample.
@@ -214,7 +214,7 @@ class PlayerFeed:
         return max(0.0, self.time_left(self.written, now))
 
     def time_left(self, byte_count: int, now: float) -> float:
-        """Return the time in seconds until the first `byte_count` bytes of the stream have been heard.
+        """Return the seconds until the first `byte_count` bytes have been heard.
 
         The result is negative if they have already been heard.
         """
@@ -243,7 +243,7 @@ class _PlayerReleased(Exception):
 
 
 class Playback:
-    """Plays one sentence, using the samples that a synthesizer writes to it.
+    """Plays one sentence from the samples of a synthesizer.
 
     All public methods except `stop` and `silence` may raise Stopped or CannotSpeak.
     """
@@ -276,7 +276,7 @@ class Playback:
         self._skipped = 0
         #: monotonic time at which to stop retrying a busy device; 0 if no device was busy
         self._busy_until = 0.0
-        #: whether the samples are synthesized in another thread, and may be late
+        #: whether another thread synthesizes the samples, so that they may be late
         self._in_background = False
         #: lengths in seconds of the gaps caused by late samples
         self.gaps: list[float] = []
@@ -286,7 +286,7 @@ class Playback:
     # -- methods for the synthesizer
 
     def begin(self, rate: int, voice: str, fallback_reason: str | None = None) -> None:
-        """Set the sample rate, report the voice to the server, and start a player unless the goal is paused.
+        """Set the sample rate, and start a player unless the goal is paused.
 
         The player starts in 1 to 15 ms, while the synthesizer produces the first samples. `write` raises its errors.
 
@@ -327,7 +327,7 @@ class Playback:
             self._with_player(self._send_all)
 
     def wait(self, descriptor: int) -> None:
-        """Keep playing until the descriptor is ready, while another thread synthesizes more samples.
+        """Keep playing until the descriptor is ready.
 
         This method may return early. If the player runs out of samples in the meantime, it doesn't count as stalled.
         """
@@ -342,7 +342,7 @@ class Playback:
     # -- methods for the driver
 
     def finish(self) -> float:
-        """Play the sentence to its end, report its remaining words, and return its length in seconds.
+        """Play the sentence to its end, and return its length in seconds.
 
         If any part of the sentence wasn't heard, this method raises CannotSpeak.
         """
@@ -408,7 +408,7 @@ class Playback:
                 self._handle_player_error(error)
 
     def _open_next_player(self) -> PlayerFeed:
-        """Open the next candidate player, and return a feed that begins with the first unheard sample."""
+        """Open the next player, and return a feed that starts at the first unheard sample."""
         self._untried = self._untried or self._players.candidates(self._rate)
         player = next(self._untried)()
         self._sent = self._begin
@@ -417,7 +417,7 @@ class Playback:
         return PlayerFeed(player, self._rate, self._clock, self._seconds(self._begin), lead_in)
 
     def _handle_player_error(self, error: CannotSpeak) -> None:
-        """Release a failed player so that the next can be tried, or raise an error if none can replace it.
+        """Release a failed player, or raise an error if no other can replace it.
 
         There is no replacement if some of the sound may have been heard, or if no other player is left.
         """
@@ -492,7 +492,7 @@ class Playback:
                 raise CannotSpeak(Reason.AUDIO_STALLED, f"{feed.player.name} accepted no sound for {limit:g} s")
 
     def _await_samples(self, feed: PlayerFeed, more: Interest) -> None:
-        """Keep playing until the descriptor `more` announces samples or the player needs attention."""
+        """Keep playing until more samples are ready or the player needs attention."""
         if self._runner.hold_number:
             self._keep_silent(feed)
         feed.player.ended()  # check for a failure here, because the wait below doesn't report it
@@ -501,7 +501,7 @@ class Playback:
         feed.progress_at = time.monotonic()  # until now, the player had nothing to play
 
     def _drain(self, feed: PlayerFeed) -> None:
-        """Send the remaining samples, and wait until the player has played them and ended."""
+        """Send the remaining samples, and wait until the player has finished."""
         self._send_all(feed)
         player = feed.player
         player.close()
@@ -525,7 +525,7 @@ class Playback:
     # -- samples
 
     def _skip_leading_zeros(self) -> bool:
-        """Decide how many zero samples at the beginning to skip.
+        """Decide how many leading zero samples to skip.
 
         Return False if it is too early to decide.
 
@@ -546,7 +546,7 @@ class Playback:
         return True
 
     def _offer_next(self, feed: PlayerFeed) -> int:
-        """Offer the next samples or the lead-in silence to the player, and return the number of bytes accepted."""
+        """Offer the next samples to the player, and return the number of bytes accepted."""
         if feed.lead_in:
             taken = feed.offer_silence(self._seconds(self._begin), feed.lead_in)
             feed.lead_in -= taken
@@ -570,7 +570,7 @@ class Playback:
         return max(self._sent, self._samples.end - self._samples.trailing_silence(limit))
 
     def _update_progress(self, feed: PlayerFeed) -> None:
-        """Adjust the clock, report the words that have started, and drop the samples that were heard."""
+        """Adjust the clock to the player's progress, and report the words that have started."""
         now = time.monotonic()
         sent_all = self._complete and self._sent == self._sendable_end(feed)
         feed.update(now, complete=sent_all and not self._runner.hold_number)
@@ -646,7 +646,7 @@ class Playback:
             now = time.monotonic()
 
     def _offer_silence(self, feed: PlayerFeed) -> int:
-        """Offer silence to the player, unless it already has enough, and return the number of bytes accepted.
+        """Offer silence to the player unless it has enough, and return the number of bytes accepted.
 
         Without this limit, some players would accept silence endlessly.
         """

@@ -115,7 +115,7 @@ class ActiveGoal:
         self.confirmed_hold = 0
         #: the first error that the driver reported
         self.error: Exception | None = None
-        #: whether a log message has reported that the driver takes too long
+        #: whether the log already says that the driver takes too long
         self.overdue_logged = False
 
 
@@ -222,7 +222,7 @@ class GoalRunner:
             self._channel.send(protocol.Alive(self._goal.id if self._goal else ""))
 
     def _execute(self, command: protocol.Command) -> None:
-        """Execute a command. A command for a goal that has already ended is ignored."""
+        """Execute a command, unless its goal has already ended."""
         goal = self._goal
         if isinstance(command, protocol.LoadVoice | protocol.DropVoice):
             if self._synthesizer is not None:
@@ -245,7 +245,7 @@ class GoalRunner:
                 self._engine.stop()
 
     def _stop_goal(self) -> None:
-        """Stop the driver or, if it isn't speaking the current goal, end the goal at once."""
+        """Stop the current goal."""
         if self._goal is not None and not self._goal.stop_requested:
             self._goal.stop_requested = True
             if self._goal.with_driver:
@@ -254,7 +254,7 @@ class GoalRunner:
                 self._end_goal(protocol.OUTCOME_STOPPED)
 
     def _send_voice_events(self) -> None:
-        """Send the server the latest events about the loading and memory of neural voices."""
+        """Send the server the latest events about neural voices."""
         loader = self._synthesizer.loader if self._synthesizer else None
         for event in loader.take_events() if loader else ():
             self._channel.send(event)
@@ -286,14 +286,14 @@ class GoalRunner:
     # -- one goal
 
     def _begin_goal(self, command: protocol.Speak) -> None:
-        """Make this the current goal, which `run` speaks next, and tell the server that it has started."""
+        """Make this the current goal, and tell the server that it has started."""
         self._goal = ActiveGoal(command, time.monotonic())
         self.hold_number, self.duration, self.gaps = 0, None, []
         self.players.begin(command)
         self._channel.send(protocol.Started(command.id))
 
     def _speak(self, goal: ActiveGoal) -> None:
-        """Set the engine's properties for a goal, and speak the goal until it has ended."""
+        """Speak a goal until it has ended."""
         try:
             goal.fallback_reason = self._set_properties(goal.command)
         except CannotSpeak as error:
@@ -319,7 +319,7 @@ class GoalRunner:
             self._fail_goal(Reason.NOTHING_TO_SAY, "nothing in the text can be spoken")
 
     def _step_driver(self, goal: ActiveGoal) -> None:
-        """Run one step of the driver, and fail the goal if the driver has dropped or rejected the text.
+        """Run one step of the driver, and fail the goal if the driver has dropped its text.
 
         `talk`'s own driver speaks the whole text in one step. A third-party driver needs many steps.
         """
@@ -337,7 +337,7 @@ class GoalRunner:
             self._pump()
 
     def _report_word(self, location: int, length: int, **_: object) -> None:
-        """Send the server the word that starts at a location in the text, unless it was sent before.
+        """Report the word at a location in the text, unless it was already reported.
 
         The notification's `name` is not compared with the goal's ID, because some drivers set it to the word.
         """
@@ -358,7 +358,7 @@ class GoalRunner:
             self._goal.error = exception
 
     def _handle_driver_finished(self, name: str | None, completed: bool, **_: object) -> None:
-        """End the current goal after the driver has finished the text, unless a pause interrupted the driver."""
+        """End the current goal after the driver has finished its text."""
         goal = self._goal
         if goal is None or name != goal.id:  # the notification is for an earlier goal
             return
@@ -418,7 +418,7 @@ class GoalRunner:
 
 
 def _with_traceback(callback: Callable[..., None]) -> Callable[..., None]:
-    """Wrap a callback so that an exception prints its traceback, because pyttsx3 drops exceptions silently."""
+    """Wrap a callback so that exceptions print a traceback."""
 
     def call(**values: Any) -> None:
         try:

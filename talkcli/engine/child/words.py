@@ -1,4 +1,4 @@
-"""Finds the words of a sentence in the text, and determines when each of them is heard.
+"""Finds the words of a sentence, and determines when each of them is heard.
 
 Nothing here reads the clock. All times are arguments, in monotonic seconds.
 """
@@ -46,7 +46,7 @@ class WordFinder:
         self._count = 0
 
     def find(self, location: int, length: int) -> tuple[int, int, int] | None:
-        """Return the start, end and number of the word at a reported location, or None if no new word starts there.
+        """Return the word at a reported location, or None if no new word starts there.
 
         The first word has number 1.
         """
@@ -113,7 +113,7 @@ class WordClock:
         self._waiting = deque(replace(each, position=max(position, each.position)) for each in self._waiting)
 
     def reset(self, position: float) -> None:
-        """Stop the clock, and prepare it for a new stream that begins at this position in the audio."""
+        """Stop the clock, and prepare it for a stream that begins at this position."""
         self._begin = position
         self._started_at = None
         self._silences.clear()
@@ -157,7 +157,7 @@ class WordClock:
         return position
 
     def next_word_at(self) -> float:
-        """Return the time at which the next word starts, or infinity if no word is left or the clock is stopped."""
+        """Return the time at which the next word starts, or infinity if there is none."""
         if self._started_at is None or not self._waiting:
             return float("inf")
         position = self._waiting[0].position

@@ -44,7 +44,7 @@ MAX_STDERR_LINE_BYTES = 1000
 
 
 def engine_command() -> list[str]:
-    """Return the command that starts an engine process with this process's interpreter and import path."""
+    """Return the command line that starts an engine process."""
     code = f"import sys; sys.path[:] = {sys.path!r}; from talkcli.engine.child.main import main; main()"
     return [sys.executable, "-c", code]
 
@@ -135,7 +135,7 @@ class EngineProcess:
             yield event
 
     def read_stderr(self) -> bool:
-        """Read the process's standard error, pass on complete lines, and return whether it is still open."""
+        """Read the process's standard error, and return whether it is still open."""
         try:
             data = os.read(self.stderr, 65536)
         except BlockingIOError:
@@ -165,7 +165,7 @@ class EngineProcess:
             kill_holders(self.liveness)
 
     def describe_exit(self) -> str:
-        """Wait briefly for the process to exit, kill it, and return a description of how it exited."""
+        """End the process, and describe how it exited."""
         wait_ready({self.liveness: select.POLLIN}, _EXIT_WAIT_S)  # macOS doesn't report a closed end without POLLIN
         self.kill()  # must happen before the process is reaped, because its group ID may be reused afterwards
         try:

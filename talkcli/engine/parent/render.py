@@ -126,7 +126,7 @@ def render(
 
 
 def split_into_pieces(text: str) -> Iterator[str]:
-    """Yield a text in pieces of at most `MAX_PIECE_CHARS`, cut at the end of a sentence or a word if possible."""
+    """Split a text into pieces, at the end of a sentence or a word if possible."""
     start = 0
     while len(text) - start > MAX_PIECE_CHARS:
         limit = start + MAX_PIECE_CHARS
@@ -218,7 +218,7 @@ def _is_stream(path: str) -> bool:
 
 @contextlib.contextmanager
 def _open_output(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> Iterator[int]:
-    """Open standard output, a pipe or a device in a `with` block, and yield its descriptor.
+    """Open standard output, a pipe or a device in a `with` block.
 
     Refuse a terminal.
     """

@@ -1,4 +1,4 @@
-"""The engine thread, which owns the engine process, gives it one goal at a time, and enforces time limits.
+"""The engine thread, which gives the engine process one goal at a time.
 
 Another thread submits the goals. Whatever the engine process does, the engine thread posts exactly one `Ended` for each
 goal, unless the goal was abandoned. It reports everything through the callback `post` and holds no lock while it waits.
@@ -33,7 +33,7 @@ RESTART_DELAYS_S = (0.0, 0.1, 0.5, 2.0, 10.0)
 #: because a third-party driver may write a line for each word.
 MAX_STDERR_LINES = 20
 STDERR_PERIOD_S = 60.0
-#: If a process exits sooner than this without having had a goal, the next start may be delayed.
+#: If a process exits sooner than this without a goal, the next start may be delayed.
 MIN_LIFETIME_S = 1.0
 #: If no process has been ready for this long, each failed start also fails a goal. Otherwise, goals would wait forever.
 ENGINE_WAIT_LIMIT_S = 10.0
@@ -293,7 +293,7 @@ class Supervisor:
             self._shut_down()
 
     def _wait_and_handle(self, until: float) -> None:
-        """Wait until a process sends something, an action is submitted, or the time is reached, and handle it."""
+        """Wait for messages and actions until a deadline, and handle them."""
         watched = dict.fromkeys([self._actions.fileno(), *self._watched], select.POLLIN)
         ready = wait_ready(watched, until - time.monotonic())
         self._actions.run()
@@ -320,7 +320,7 @@ class Supervisor:
             yield self._last_sign_at + HANG_LIMIT_S, f"{no_sign} while loading {self._loading}"
 
     def _handle_deadlines(self, now: float) -> None:
-        """Replace a process that has missed a deadline, start a missing process, or kill a dying one again."""
+        """Handle deadlines that have passed, and start a missing process."""
         missed = next((message for deadline, message in self._deadlines() if now >= deadline), None)
         if missed:
             self._lose_process(missed, Reason.ENGINE_HUNG)
@@ -445,7 +445,7 @@ class Supervisor:
     # -- the process
 
     def _start_process(self) -> None:
-        """Start an engine process. If this fails, report it and schedule another start."""
+        """Start an engine process, or schedule another start if this fails."""
         self._started_at = time.monotonic()
         try:
             process = EngineProcess(self._configure, self._report_stderr)
@@ -480,7 +480,7 @@ class Supervisor:
         self._lose_process(f"the engine crashed: {process.describe_exit()}", Reason.ENGINE_CRASHED)
 
     def _handle_event(self, process: EngineProcess, event: protocol.Event) -> None:
-        """Update the state after an event from the process, and post the event if others need it."""
+        """Handle an event from the process."""
         self._last_sign_at = time.monotonic()
         if isinstance(event, protocol.GoalEvent):
             goal = self._current_goal(event.id)
@@ -498,7 +498,7 @@ class Supervisor:
         self._send_waiting_goal()
 
     def _handle_goal_event(self, goal: SupervisedGoal, event: protocol.GoalEvent) -> None:
-        """Update the current goal after an event about it, and post the event if others need it."""
+        """Handle an event about the current goal."""
         if isinstance(event, protocol.Started):
             goal.started = True
         elif isinstance(event, protocol.Ended):
@@ -510,7 +510,7 @@ class Supervisor:
             self._post(event)
 
     def _lose_process(self, message: str, reason: Reason, failure: protocol.StartFailed | None = None) -> None:
-        """Kill the process, decide what happens to its goal, and schedule the next start.
+        """Kill the process, and schedule the next start.
 
         Args:
             message: a human-readable description of what happened.
@@ -576,7 +576,7 @@ class Supervisor:
             self._end_goal(goal.end)
 
     def _shut_down(self) -> None:
-        """Kill the process, wait a limited time for it to exit, and close all descriptors."""
+        """Kill the process, wait briefly for it to exit, and close all descriptors."""
         self._lose_process("the server is shutting down", Reason.SHUTDOWN)
         deadline = time.monotonic() + KILL_LIMIT_S / 4
         while self._dying and time.monotonic() < deadline:

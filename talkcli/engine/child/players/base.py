@@ -127,13 +127,13 @@ class Player(Protocol):
         """
 
     def interests(self) -> Sequence[Interest]:
-        """Return the open descriptors to poll for room, a failure or the end, each with its poll events.
+        """Return the descriptors to poll, each with its poll events.
 
         The playback ignores descriptors that only wait for POLLOUT while it has no samples to offer.
         """
 
     def wake_at(self) -> float:
-        """Return the monotonic time at which to check the player again, or NEVER if polling is enough."""
+        """Return when to check the player again, or NEVER if polling is enough."""
 
     def kill(self) -> None:
         """Stop playing at once, and start to release all resources.
@@ -142,7 +142,7 @@ class Player(Protocol):
         """
 
     def gone(self) -> bool:
-        """Return whether the player is certainly silent and has released its descriptors, processes and threads.
+        """Return whether the player is silent and has released its resources.
 
         It is called every 20 ms after `kill`. If it still returns False after one second, the engine process exits.
         """

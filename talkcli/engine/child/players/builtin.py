@@ -34,7 +34,7 @@ _MAX_WAV_BYTES = _UNKNOWN_BYTES - _WAV_HEADER.size
 
 
 class BuiltInPlayer(Player):
-    """Base class of players that process samples at once and have nothing to release."""
+    """Base class of players that process samples at once."""
 
     proven = True
 
@@ -72,7 +72,7 @@ class BuiltInPlayer(Player):
 
 
 class NullPlayer(BuiltInPlayer):
-    """Accepts samples as slowly as a loudspeaker would play them, but makes no sound.
+    """A player that consumes samples in real time but makes no sound.
 
     This player is for simulated robots and for CI, where scripts have to keep their timing.
     """
@@ -163,7 +163,7 @@ class WavPlayer(BuiltInPlayer):
                 os.close(self._file)  # some network file systems report a full disk or an exceeded quota only here
 
     def kill(self) -> None:
-        """Keep the samples written so far, close the file, and ignore any error."""
+        """Close the file, and keep the samples written so far."""
         with contextlib.suppress(CannotSpeak):  # the sentence was stopped, or has already failed with another error
             self.close()
 
@@ -193,7 +193,7 @@ class WavStreamPlayer(BuiltInPlayer):
         self._header = _WAV_HEADER.pack(*_header_fields(rate, _UNKNOWN_BYTES)) if first else b""
 
     def offer(self, data: memoryview) -> int:
-        """Write the samples if the output has room, and return the number of sample bytes written."""
+        """Write the samples if the output has room, and return the number of bytes written."""
         # A writable pipe has room for at least a header and a piece of samples.
         if not wait_ready({self._output: select.POLLOUT}, 0.0):
             return 0
@@ -205,11 +205,11 @@ class WavStreamPlayer(BuiltInPlayer):
         return written - header
 
     def interests(self) -> list[Interest]:
-        """Return the output's descriptor, to be polled for room."""
+        """Return the descriptor of the output."""
         return [(self._output, select.POLLOUT)]
 
     def wake_at(self) -> float:
-        """Return NEVER, because the output's descriptor reports when there is room."""
+        """Return NEVER, because polling the output is enough."""
         return NEVER
 
 
@@ -248,7 +248,7 @@ def _header_fields(rate: int, sample_bytes: int) -> tuple[bytes | int, ...]:
 
 
 def _read_sample_bytes(file: int, path: str, rate: int) -> int:
-    """Read the number of sample bytes from a file's WAV header, or return 0 if the file is empty.
+    """Read the number of sample bytes from a file's WAV header.
 
     Raises:
         CannotSpeak: The file wasn't written by a `WavPlayer` with this sample rate.

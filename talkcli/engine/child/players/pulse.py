@@ -49,8 +49,7 @@ class Level:
 
     volume: float  # volume of the loudest channel; 1.0 is 100 %, and higher values are possible
     muted: bool
-    #: whether the volumes of the sink's streams are absolute, so that the sink's own volume doesn't reduce them any
-    #: further
+    #: whether stream volumes are absolute, so that the sink's volume doesn't reduce them further
     flat: bool = False
 
 
@@ -78,8 +77,7 @@ class PulsePlayer(Player):
         self._wanted_device = device
         self._audible = audible
         self._written = self._heard = 0
-        #: the number of seconds heard according to the server's last report, and the time of that report; None until
-        #: sound is heard
+        #: the seconds heard and the time, from the server's last report; None until sound is heard
         self._clock_report: tuple[float, float] | None = None
         #: the number of bytes written when the server last ran out of samples, or None while it plays
         self._dry_at: int | None = None
@@ -168,11 +166,11 @@ class PulsePlayer(Player):
         return self._drained
 
     def interests(self) -> list[Interest]:
-        """Return the descriptors that libpulse wants to wait for, each with its poll events."""
+        """Return libpulse's descriptors, each with its poll events."""
         return self._loop.interests
 
     def wake_at(self) -> float:
-        """Run libpulse, and return the time at which it has more work to do or a time limit ends.
+        """Run libpulse, and return when it needs to run again.
 
         The result is 0, which means now, if the server has room for samples. It is also 0 after each report of the
         playback time, because words may be due.
@@ -185,7 +183,7 @@ class PulsePlayer(Player):
         return min(self._loop.wake_at, self._ready_by, self._resumed_by, self._time_request_at, settled_at)
 
     def kill(self) -> None:
-        """Close the connection, so that the server drops the stream and its remaining samples."""
+        """Close the connection, which makes the server drop the stream."""
         if self._loop.freed:
             return
         self._lib.context_disconnect(self._context)
@@ -202,7 +200,7 @@ class PulsePlayer(Player):
 
     @property
     def output(self) -> Output | None:
-        """The sink, its volume and whether it was muted, or None until the server has reported them."""
+        """The sink, its volume and mute state; None until the server reports them."""
         sink, stream = self._sink_level, self._stream_level
         if self.device is None or sink is None or stream is None or self._is_volume_pending():
             return None
@@ -212,7 +210,7 @@ class PulsePlayer(Player):
     # -- the states of the stream
 
     def _run_and_check(self) -> None:
-        """Process the server's messages. If the stream has failed, raise CannotSpeak.
+        """Run libpulse, and raise CannotSpeak if the stream has failed.
 
         Raises:
             CannotSpeak: The stream has failed.
@@ -222,7 +220,7 @@ class PulsePlayer(Player):
             raise self._error
 
     def _run_libpulse(self) -> None:
-        """Run libpulse and take the next steps of the stream until there is no more work."""
+        """Run libpulse until there is no more work."""
         while self._loop.iterate() or self._advance_stream():
             pass
 
@@ -309,7 +307,7 @@ class PulsePlayer(Player):
         return changed
 
     def _request_time(self) -> bool:
-        """Send a request for the playback time if one is due, and return whether it was sent."""
+        """Request the playback time if it is due, and return whether a request was sent."""
         if time.monotonic() < self._time_request_at:
             return False
         self._time_request_at = NEVER
@@ -317,19 +315,19 @@ class PulsePlayer(Player):
         return True
 
     def _request_levels(self, *_: Any) -> None:
-        """Request the volumes of the sink and the stream. libpulse calls this if any volume may have changed."""
+        """Request the volumes of the sink and the stream."""
         self._pending_levels += 1
         sink, stream = self._sink_index, self._lib.stream_get_index(self._stream)
         self._release(self._lib.context_get_sink_info_by_index(self._context, sink, self._sink_callback, None))
         self._release(self._lib.context_get_sink_input_info(self._context, stream, self._stream_callback, None))
 
     def _release(self, operation: int | None) -> None:
-        """Release the handle of an operation, if there is one. The operation keeps running."""
+        """Release the handle of an operation, which keeps running."""
         if operation is not None:
             self._lib.operation_unref(operation)
 
     def _room(self) -> int:
-        """Return how many bytes of whole samples the server has room for, or 0 if writing isn't possible now."""
+        """Return how many bytes the server has room for."""
         if self._sink_index == libpulse.NO_INDEX or self._closed or self._error is not None:
             return 0
         if self._audible and not (self._level_refused or self.output):
@@ -345,7 +343,7 @@ class PulsePlayer(Player):
         return self._pending_levels > 0 or time.monotonic() < self._volume_settled_at
 
     def _record_mute(self) -> None:
-        """If the output is silent now, mark the sentence as muted, or as failed if it must be audible."""
+        """If the output is silent, mark the sentence as muted or failed."""
         levels = [each for each in (self._sink_level, self._stream_level) if each is not None]
         if self._drained or self._is_volume_pending() or not any(each.muted or each.volume == 0 for each in levels):
             return
@@ -381,7 +379,7 @@ class PulsePlayer(Player):
     # -- callbacks of libpulse
 
     def _on_started(self, *_: Any) -> None:
-        """Restart the clock after the server has started to play, which proves that sound was heard."""
+        """Restart the clock, because the server has started to play."""
         self.proven, self._dry_at = True, None
         self._restart_clock()
 
@@ -390,7 +388,7 @@ class PulsePlayer(Player):
         self._dry_at = self._written
 
     def _on_time(self, *_: Any) -> None:
-        """Store the playback time that the server has reported, or request it again if nothing has been heard yet."""
+        """Store the playback time reported by the server."""
         if not self.proven:
             return  # before the stream has started, the reported time is only the delay of the answer
         heard, now = c_uint64(), time.monotonic()

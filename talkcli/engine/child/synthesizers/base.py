@@ -107,7 +107,7 @@ class Synthesizer(Protocol):
         """
 
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
-        """Synthesize a sentence, and return after writing all of it to the sink.
+        """Synthesize a sentence, and write it to the sink.
 
         The sample rate comes first, and every word is reported before its first sample is written. The times of words
         never decrease, but their positions in the text may jump back and repeat.

@@ -39,7 +39,7 @@ class CombinedSynthesizer:
         return (*self._espeak.voices(), *models.installed_voices())
 
     def load(self, voice: str) -> None:
-        """Choose a voice of libespeak-ng or a neural voice for the next sentences."""
+        """Choose the voice for the next sentences."""
         current: Synthesizer = self._get_piper() if is_neural(voice) else self._espeak
         current.load(voice)
         self._current, self.voice = current, current.voice
@@ -88,7 +88,7 @@ class CombinedSynthesizer:
             loader.start(command.voice)
 
     def _get_piper(self) -> Piper:
-        """Return the synthesizer for neural voices, which the first call creates."""
+        """Return the synthesizer for neural voices, and create it on first use."""
         if self._neural is None:
             from talkcli.engine.child.synthesizers.piper import Piper
 

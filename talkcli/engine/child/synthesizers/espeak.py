@@ -182,7 +182,7 @@ class Espeak:
         return (*_list_voices(self._espeak, None), *_list_mbrola_voices(self._espeak), *_list_variants(self._espeak))
 
     def load(self, voice: str) -> None:
-        """Load a voice by its id, which may end with a variant, or by another name known to the library.
+        """Load a voice by its id or by another name known to the library.
 
         Raises:
             UnknownVoice: One of the voice's files is missing. The library keeps the previous voice.
@@ -244,7 +244,7 @@ class Espeak:
 
     @contextlib.contextmanager
     def phonemizer(self, language: str) -> Iterator[EspeakPhonemizer]:
-        """Switch the library to a language, and provide a phonemizer for it in a `with` block.
+        """Provide a phonemizer for a language in a `with` block.
 
         Another thread may use the phonemizer during the block, but nothing may use the synthesizer. After the block,
         calls of the phonemizer raise Stopped. If a call is still running at the end of the block, it continues for a
@@ -275,7 +275,7 @@ class Espeak:
         """Wait for the last phonemizer to finish, and switch back to the synthesizer's voice."""
         phonemizer, self._phonemizer = self._phonemizer, None
         if phonemizer is not None:
-            with phonemizer.busy:  # Its last call may still be running.
+            with phonemizer.busy:  # The phonemizer's last call may still be running.
                 self._espeak.SetVoiceByName(self.voice.encode())
             self._parameters.clear()
 
@@ -291,7 +291,7 @@ class Espeak:
 
 
 class EspeakPhonemizer:
-    """Converts text to phonemes with libespeak-ng, as `phonemes.Phonemizer` describes.
+    """Converts text to phonemes with libespeak-ng.
 
     Args:
         espeak: pyttsx3's binding of the library.
@@ -400,7 +400,7 @@ def _list_variants(espeak: Any) -> list[Voice]:
 
 
 def _list_mbrola_voices(espeak: Any) -> list[Voice]:
-    """Return those of the MBROLA voices listed by the library that are installed."""
+    """Return the library's MBROLA voices that are installed."""
     if not on_path("mbrola"):
         return []
     return [each for each in _list_voices(espeak, _MBROLA) if _has_mbrola_data(each.id)]

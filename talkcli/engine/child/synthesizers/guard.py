@@ -86,7 +86,7 @@ _SEPARATE_DIGITS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def guarded(text: str, voice: str = "") -> str:
-    """Replace the characters of a text that would crash libespeak-ng, and return the text.
+    """Replace the characters in a text that would crash libespeak-ng.
 
     Its length stays the same.
 
@@ -104,13 +104,13 @@ def guarded(text: str, voice: str = "") -> str:
 
 
 def _unsafe_characters(language: str) -> re.Pattern[str]:
-    """Return a pattern that matches the characters that crash the voices of a language."""
+    """Return a pattern for the characters that crash the voices of a language."""
     found = (signs for languages, signs in _CRASHING_CHARACTERS.items() if language not in languages)
     return re.compile(f"[{''.join(found)}]")
 
 
 def _split_number(number: str, least: int, most: int) -> str:
-    """Return a number, split in two with a superscript digit if it has `least` to `most` digits."""
+    """Split a number in two if it has `least` to `most` digits."""
     if not least <= sum(map(str.isdigit, number)) <= most:
         return number
     middle = next(place for place in range(len(number) // 2, len(number)) if number[place].isdigit())
@@ -118,7 +118,7 @@ def _split_number(number: str, least: int, most: int) -> str:
 
 
 def _without_long_initials(text: str) -> str:
-    """Return a text with blanks for dots in long sequences of initials, which would overrun the library's buffers."""
+    """Replace the dots in long sequences of initials with blanks."""
     result = list(text)
     looked_up = spelled = words = size = 0
     dots: list[int] = []
@@ -172,14 +172,14 @@ def _utf8_bytes(text: str) -> int:
 
 
 def _max_bytes(character: str) -> int:
-    """Return the maximum number of bytes that the library may need for a character or its replacement."""
+    """Return the most bytes that the library may need for a character."""
     if _HANGUL <= character <= _HANGUL_END:
         return 9
     return max(2, _utf8_bytes(character), _utf8_bytes(character.lower()))
 
 
 def _without_leading_hyphens(text: str) -> str:
-    """Return a text with blanks for hyphens that follow only symbols in their clause, as in "'-o".
+    """Replace hyphens that follow only symbols in their clause with blanks.
 
     The library doesn't mark the beginning of the word after such a hyphen. Later, it looks for the mark and reads
     beyond the start of its list of phonemes. This crashes Vietnamese, Danish, Hindi and other voices.
@@ -195,7 +195,7 @@ def _without_leading_hyphens(text: str) -> str:
 
 
 def _split_word(match: re.Match[str]) -> str:
-    """Return the matched text. A word that is too long for the library is split.
+    """Split the matched word if it is too long for the library.
 
     Apostrophes become blanks, or pairs of letters get another case.
     """

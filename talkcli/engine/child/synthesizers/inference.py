@@ -51,7 +51,7 @@ _MAX_ERROR_CHARS = 200
 #: The version of `vits.split_model`. Increase it whenever that function returns different halves, so that old cached
 #: halves are no longer used.
 _SPLIT_VERSION = 1
-#: The names of the inputs that every model has, and of the extra input of a model with several speakers.
+#: The names of the inputs of every model, and of the extra input for the speaker.
 _INPUTS, _SPEAKER_INPUT = ("input", "input_lengths", "scales"), "sid"
 
 #: The maximum size of the cache, which has room for about eight voices. If the cache gets larger, the oldest files are
@@ -98,7 +98,7 @@ class ModelCache:
         return paths
 
     def store(self, key: str, make_encoder: Callable[[str | None], Any], decoder: Iterable[Buffer]) -> Any:
-        """Create and return the encoder, store both halves of the model if possible, and remove old files.
+        """Create the encoder of a model, and cache both halves if possible.
 
         Args:
             key: The key of the model.
@@ -128,7 +128,7 @@ class ModelCache:
         return os.path.join(self._directory, key + suffix)
 
     def _shrink(self) -> None:
-        """Remove the oldest files if the cache is too large, and temporary directories of processes that have died."""
+        """Remove old files if the cache is too large, and leftover temporary directories."""
         size = 0
         with contextlib.suppress(OSError):  # Another process may be removing the same files.
             cached = [each for each in os.scandir(self._directory) if _CACHED_NAME.fullmatch(each.name)]
@@ -234,7 +234,7 @@ class Model:
         return Frames(tuple(values), tuple(int(each) for each in np.cumsum(durations)))
 
     def decode(self, frames: Frames, begin: int, end: int, run: ModelRun) -> Any:
-        """Decode the frames from `begin` to `end - 1`, and return their samples as floats from -1.0 to 1.0.
+        """Decode a range of frames, and return their samples as floats.
 
         Raises:
             VoiceFileError: The model is faulty, or the run was ended.
@@ -261,7 +261,7 @@ class Model:
         return frames * self._samples_per_frame / self.description.rate
 
     def _set_halves(self, encoder: Any, decoder: Any) -> None:
-        """Store both halves of the model, check them, and test them with a phoneme.
+        """Store both halves of the model, and test them.
 
         Raises:
             VoiceFileError: The halves are faulty, or don't match the description.
@@ -287,7 +287,7 @@ class Model:
         return found
 
     def _test_model(self) -> int:
-        """Synthesize the phoneme with the highest id as a test, and return the number of samples per frame."""
+        """Test the model with one phoneme, and return the number of samples per frame."""
         ids = self.description.phoneme_ids
         highest = max(each for every in ids.values() for each in every)
         phonemes = [*ids[BEGIN_SYMBOL], *ids[PAD_SYMBOL], highest, *ids[PAD_SYMBOL], *ids[END_SYMBOL]]
@@ -330,7 +330,7 @@ def load_libraries(path: str) -> None:
 
 
 def _split_and_cache(path: str, content: bytes, cache: ModelCache | None, key: str) -> tuple[Any, Any]:
-    """Split a model, cache its halves, and return an onnxruntime session for each half.
+    """Split and cache a model, and return a session for each half.
 
     Raises:
         VoiceFileError: The model can't be split or loaded.

@@ -96,7 +96,7 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
         return item
 
     def close(self) -> None:
-        """Tell the thread to discard its current item and end, without waiting for it.
+        """Tell the thread to end, without waiting for it.
 
         Call this only once.
         """
@@ -107,7 +107,7 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
         self._room.release()
 
     def _put(self, item: _T | None, error: BaseException | None = None) -> None:
-        """Add an item or a mark for the end of the iterator, and make the descriptor readable."""
+        """Add an item or the end mark, and make the descriptor readable."""
         self._made.append((item, error))
         with self._lock:
             if not self._closed:
@@ -118,14 +118,14 @@ class ModelLoader:
     """Loads neural voices one after another, and stores their models."""
 
     def __init__(self) -> None:
-        #: the loaded models by voice, with the fingerprints that their files had before they were loaded
+        #: the loaded models by voice, with the fingerprints of their files before loading
         self._models: dict[str, tuple[Model, _Fingerprints]] = {}
         self._waiting: deque[str] = deque()
         self._load: BackgroundIterator[tuple[Model, _Fingerprints]] | None = None
         #: the voice that is being loaded, and when its load started (monotonic time)
         self._voice = ""
         self._started_at = 0.0
-        #: error messages by voice, for voices that couldn't be loaded, or have failed to speak a sentence
+        #: error messages by voice, for voices that failed to load or to speak
         self.errors: dict[str, str] = {}
         self._events: list[VoiceLoaded | VoiceUnloaded | VoiceMemory] = []
         #: the private memory of the process before the first load, and how much it had grown at the last report
@@ -193,7 +193,7 @@ class ModelLoader:
             self._unmeasured = voice
 
     def take_events(self) -> list[VoiceLoaded | VoiceUnloaded | VoiceMemory]:
-        """Return and clear the events since the last call, including that of a load that has just finished."""
+        """Return and clear the events since the last call."""
         self._finish_load()
         if self._unmeasured is not None:
             self._measure_memory(self._unmeasured, min_growth=GROWTH_BYTES)
@@ -201,7 +201,7 @@ class ModelLoader:
         return events
 
     def _finish_load(self) -> None:
-        """If the load has finished or takes too long, store its result and start the next load."""
+        """Finish the current load if it is complete or takes too long."""
         load, voice = self._load, self._voice
         if load is None:
             return
@@ -227,7 +227,7 @@ class ModelLoader:
         self._start_next_load()
 
     def _measure_memory(self, voice: str, min_growth: float = -math.inf) -> None:
-        """Record an event with the growth of the process's memory since before the first load.
+        """Record an event about the growth of the process's memory.
 
         If the growth since the last event is below `min_growth` bytes, record nothing unless a voice was unloaded.
         """
@@ -252,7 +252,7 @@ class ModelLoader:
 
 
 def _fingerprints(path: str) -> _Fingerprints:
-    """Return values that change whenever the files of a voice change, or () if a file can't be found."""
+    """Return the fingerprints of a voice's files, or () if a file is missing."""
     try:
         found = [os.stat(each) for each in (path, path + models.JSON_SUFFIX)]
     except OSError:

@@ -78,7 +78,7 @@ class SpeechPart:
 
 
 def split_text(phonemizer: Phonemizer, text: str) -> Iterator[SpeechPart]:
-    """Yield the parts of a text, each short enough for one run of a model.
+    """Split a text into parts that are short enough for one run of a model.
 
     A text without any speech has no parts. The phonemizer is used only while a part is being requested.
     """
@@ -120,7 +120,7 @@ def split_text(phonemizer: Phonemizer, text: str) -> Iterator[SpeechPart]:
 
 
 def _split_long_groups(groups: Sequence[str]) -> Iterator[str]:
-    """Yield the groups of phonemes, but split those that are too long for a part."""
+    """Split groups of phonemes that are too long for a part."""
     for group in groups:
         for begin in range(0, len(group), _MAX_SECTION_PHONEMES):
             yield group[begin : begin + _MAX_SECTION_PHONEMES]
@@ -132,7 +132,7 @@ def _phoneme_groups(ipa: str) -> list[str]:
 
 
 def _locate_words(phonemizer: Phonemizer, clause: str, groups: Sequence[str]) -> list[tuple[int, int, int]]:
-    """Return the index of the first phoneme of each word in a clause, with the word's start and length.
+    """Find the first phoneme of each word in a clause.
 
     The phonemes are counted across all groups.
     """
@@ -156,7 +156,7 @@ def _locate_words(phonemizer: Phonemizer, clause: str, groups: Sequence[str]) ->
 
 
 def _drop_repeated_positions(positions: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the word positions without those that repeat an earlier one or go back in the text."""
+    """Drop word positions that repeat an earlier one or go back in the text."""
     found: list[tuple[int, int]] = []
     for position in positions:
         if not found or position[0] > found[-1][0]:

@@ -69,7 +69,7 @@ _MIN_SCALE = 0.1
 
 
 class Piper:
-    """A synthesizer for Piper's neural voices. It uses libespeak-ng only while it speaks."""
+    """A synthesizer for Piper's neural voices."""
 
     version: str | None = None
 
@@ -77,14 +77,14 @@ class Piper:
         self._espeak = espeak
         self.loader = ModelLoader()
         self.voice = ""
-        #: whether any sound of the last sentence was written to its sink
+        #: whether the last sentence has produced any sound
         self.has_written = False
         #: the id of the current voice without the speaker, the speaker, and the path of the model
         self._model_id, self._speaker, self._path = "", "", ""
 
     @property
     def problem(self) -> str | None:
-        """A message saying why the current voice can't speak, or None if it is loaded."""
+        """The reason why the current voice can't speak, or None if it is loaded."""
         if self.loader.get_model(self._model_id) is not None:
             return None
         return self.loader.errors.get(self._model_id) or f"{self.voice} is not loaded"
@@ -172,7 +172,7 @@ class Piper:
         return model
 
     def _write_sound(self, parts: Iterator[SpokenPart], rate: int, run: ModelRun, sink: SampleSink) -> None:
-        """Synthesize parts of a text in a background thread, and write their sound and words to the sink."""
+        """Synthesize parts of a text in a background thread, and write them to the sink."""
         write_bytes = int(_WRITE_S * rate) * SAMPLE_BYTES
         seconds = 0.0
         spoken_parts = BackgroundIterator(parts, _MAX_PARTS_AHEAD)
@@ -194,7 +194,7 @@ class Piper:
 def _speak_parts(
     model: Model, parts: Iterator[SpeechPart], speaker: int, settings: SpeechSettings, run: ModelRun
 ) -> Iterator[SpokenPart]:
-    """Synthesize the parts of a text, and yield the sound in small pieces, each with its words.
+    """Synthesize the parts of a text, and yield the sound in small pieces.
 
     Raises:
         VoiceFileError: The model is faulty, or doesn't know any of the phonemes.
@@ -262,7 +262,7 @@ def _word_time(model: Model, part: SpeechPart, places: Sequence[int], begins: Se
 
 
 def _cut_leading_silence(samples: Any, levels: Any, words: WordTimes, rate: int) -> tuple[Any, WordTimes]:
-    """Return the samples without the silence at the start of a sentence, and its words with adjusted times."""
+    """Cut the silence at the start of a sentence, and adjust the times of its words."""
     audible = (levels > _LEADING_LEVEL).nonzero()[0]
     cut = max(0, int(audible[0]) - int(_LEADING_S * rate)) if len(audible) else 0
     return samples[cut:], tuple((start, length, max(0.0, time - cut / rate)) for start, length, time in words)

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     Buffer = bytes | memoryview
     #: a field of a message: its number, its wire type (one of the four below), and its value. Integers stay encoded.
     Field = tuple[int, int, Buffer]
-    #: half of a model, which is a complete ONNX file in parts. The weights, which make up nearly all of it, are not
-    #: copied.
+    #: half of a model, as the parts of a complete ONNX file. The weights are not copied.
     ModelHalf = tuple[Buffer, ...]
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
@@ -100,7 +99,7 @@ def split_model(model: Buffer) -> tuple[ModelHalf, ModelHalf]:
 
 
 class _Reader:
-    """Reads the protobuf messages of one model. It limits the total number of fields."""
+    """Reads the protobuf messages of one model."""
 
     def __init__(self) -> None:
         self._fields_left = _MAX_FIELDS
@@ -153,7 +152,7 @@ class _Node:
 
 
 class _Graph:
-    """A graph of operations, with its nodes in execution order and its weights."""
+    """A graph of operations, with its weights."""
 
     def __init__(self, reader: _Reader, raw: Buffer, depth: int = 0) -> None:
         if depth > _MAX_NESTED_GRAPHS:
