@@ -44,12 +44,12 @@ def test_goals_are_spoken_awaited_and_preempted(speaking: Talk, shell: Shell) ->
     assert (settings["rate"], settings["voice"], "German" in done.stdout) == (140, "german", True)
 
 
-@runs("Say something: Keep it true", "Stop")
+@runs("Say something: Drop outdated sentences", "Stop")
 def test_options_of_a_goal_and_cancels_work(speaking: Talk, shell: Shell) -> None:
     *cancels, pause, resume = commands("Stop")
     assert shell.run(pause).returncode == 0
     assert speaking.request("status")["server"]["paused"]
-    done = shell.run("\n".join(commands("Say something: Keep it true")))
+    done = shell.run("\n".join(commands("Say something: Drop outdated sentences")))
     assert done.returncode == 0
     first, second, _, fourth = map(speaking.goal, done.stdout.split())
     assert (first["ttl"], second["key"], fourth["id"]) == (5, "eta", "docking-17")
