@@ -43,7 +43,7 @@ class Finding:
 
 @frozen
 class Question:
-    """The question that an examination answers, with the text of each possible answer."""
+    """The question that an examination answers, with all possible answers."""
 
     #: the human-readable answers
     yes: str

@@ -171,7 +171,7 @@ def speak_by_engine(text: str, options: EngineOptions, volume: float, limit: flo
 
 
 def find_playback_step(findings: Sequence[Finding], *, custom: bool = False) -> str | None:
-    """Return advice for the most likely cause of a playback fault, or None if no cause was found.
+    """Return advice for the most likely cause of a playback fault.
 
     Args:
         findings: the findings of all checks before the sentence.

@@ -73,7 +73,7 @@ class SocketPlace:
     """What was found at a path where a server may listen."""
 
     path: str
-    #: what is there: one of the PLACE texts, or the system's error message
+    #: one of the PLACE texts, or the system's error message
     what: str
     #: owner of the process or the file, or None if unknown
     uid: int | None = None
@@ -148,7 +148,7 @@ def request_status_and_log(client: Client) -> tuple[JsonObject, list[Goal]]:
 
 
 def local_pid(client: Client) -> int | None:
-    """Return the server's process id, or None if the server runs on another machine.
+    """Return the server's process id, or None if the server runs elsewhere.
 
     The server's socket may be forwarded by ssh, for example.
 
@@ -229,7 +229,7 @@ def judge_unresponsive_server(message: str) -> Finding:
 
 
 def judge_server(server: JsonObject, log: Sequence[Goal], now: float) -> list[Finding]:
-    """Return the findings about the server's state and settings, and about recent failures.
+    """Return the findings about the server's state, settings and recent failures.
 
     Args:
         server: the server's description of itself.

@@ -313,7 +313,7 @@ def _parse_pulse_sinks(output: ProgramOutput) -> dict[str, str]:
 
 
 def _parse_pipewire_sinks(output: ProgramOutput) -> list[str]:
-    """Return the names of the sinks in the list of nodes printed by `pw-cli ls Node`."""
+    """Return the names of the sinks listed by `pw-cli ls Node`."""
     nodes = re.split(r"^\s*id \d+,", output.stdout, flags=re.MULTILINE)
     found = [re.search(r'node\.name = "([^"]*)"', each) for each in nodes if '"Audio/Sink"' in each]
     return [each[1] for each in found if each]
@@ -330,7 +330,7 @@ DEVICE_LISTS: dict[str, tuple[str, Callable[[ProgramOutput], Iterable[str]], str
 
 
 def add_pactl_hint(finding: Finding, env: Mapping[str, str]) -> Finding:
-    """Add a hint on how to install pactl if a finding's advice needs it and it is missing."""
+    """Add a hint on how to install pactl if the advice needs it and it is missing."""
     if finding.next is None or "pactl " not in finding.next or on_path("pactl", env):
         return finding
     return replace(finding, next=f"{finding.next} (to install pactl: sudo apt-get install -y {PACKAGES['pacat']})")
@@ -396,7 +396,7 @@ def check_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[st
 
 
 def _read_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[str]) -> Iterable[tuple[str, ...]]:
-    """Run mixer programs, and yield arguments of `judge_level` for each output."""
+    """Yield arguments of `judge_level` for each output."""
     if server.name is not None:
         mute = run_program("pactl", "get-sink-mute", "@DEFAULT_SINK@", env=env)
         if mute.error is None:

@@ -112,7 +112,7 @@ class VoiceTrial:
 
 
 def installed_version(package: str) -> str | None:
-    """Return the version of a package without importing it, or None if it is not installed."""
+    """Return the version of a package without importing it."""
     with contextlib.suppress(PackageNotFoundError):
         return version(package)
     return None
@@ -321,7 +321,7 @@ def _speak(engine: PrivateEngine, voice: str, text: str) -> tuple[protocol.Ended
 
 
 def _memory_of(pid: int) -> int | None:
-    """Return the resident memory of a process in bytes, or None if it is unknown."""
+    """Return the resident memory of a process in bytes."""
     statm = read_proc_file(f"/proc/{pid}/statm")  # the second number is the count of resident pages
     return int(statm.split()[1]) * os.sysconf("SC_PAGE_SIZE") if statm else None
 

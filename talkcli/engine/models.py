@@ -1,4 +1,4 @@
-"""Functions to find the files of neural voices, check their permissions, and read their descriptions.
+"""Functions to find, check and describe neural voices.
 
 A voice consists of NAME.onnx and NAME.onnx.json, either in one of `paths.voice_directories` or in an installed package
 `*_piper_voice`. Users give the name of the file and never a path, so a client can't make the server read any other
@@ -29,7 +29,7 @@ PACKAGE_VARIABLES = {
     # Since version 1.30, onnxruntime writes a device id into ~/.cache/Microsoft when it is imported, and contacts a
     # server some seconds later. A robot must never do this.
     "ORT_DISABLE_TELEMETRY": "1",
-    # When it is imported, numpy would start threads that take longer than the import itself. Voices don't need them.
+    # Importing numpy would start threads, which takes longer than the import itself. Voices don't need them.
     "OPENBLAS_NUM_THREADS": "1",
 }
 
@@ -52,7 +52,7 @@ PAD_SYMBOL, BEGIN_SYMBOL, END_SYMBOL = "_", "^", "$"
 
 
 class VoiceFileError(Exception):
-    """Raised if a neural voice can't be used, usually because one of its files is missing, unsafe or invalid."""
+    """Raised if a neural voice can't be used."""
 
 
 @frozen
@@ -76,7 +76,7 @@ class VoiceDescription:
 
 
 def missing_package() -> str | None:
-    """Return an error message if a package for neural voices is missing, otherwise None."""
+    """Return an error message if a package for neural voices is missing."""
     from importlib.util import find_spec
 
     missing = next((each for each in install.NEURAL_PACKAGES if find_spec(each) is None), None)
@@ -108,7 +108,7 @@ def installed_voices() -> tuple[Voice, ...]:
 
 
 def undescribed_voices(environment: Mapping[str, str] | None = None) -> tuple[Voice, ...]:
-    """Return all installed neural voices by name only, without reading their descriptions."""
+    """Return all installed neural voices without reading their descriptions."""
     return tuple(Voice(NEURAL_PREFIX + name, None, name) for name in find_models(environment))
 
 
@@ -261,7 +261,7 @@ def _writable_error(*paths: str) -> VoiceFileError:
 
 
 def _model_directories(environment: Mapping[str, str] | None) -> Iterator[str]:
-    """Yield the directories to search for models, including those in installed Python packages."""
+    """Yield the directories to search for models."""
     yield from voice_directories(environment)
     for directory in filter(None, sys.path):
         for package in _list_entries(os.path.abspath(directory), _PACKAGE_SUFFIX):

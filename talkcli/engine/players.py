@@ -55,7 +55,7 @@ class PlayerCommand:
 
 @frozen
 class KnownPlayer:
-    """A player that users can select by name: a program, or a class in `talkcli.engine.child.players`."""
+    """A player that users can select by name."""
 
     #: a short description of the player's output, such as "ALSA"
     description: str

@@ -82,7 +82,7 @@ def find_voice(wanted: str, voices: tuple[Voice, ...], preferred: str | None = N
 
 
 def matching_languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
-    """Return the languages that match a language code or an English name, such as "en-gb" for "English"."""
+    """Return the languages that match a language code or an English name."""
     known = {each.language for each in voices if each.language}
     word = _fold(wanted)
     region = _WITH_REGION.fullmatch(word)
@@ -151,7 +151,7 @@ def _english_names(voice: Voice) -> list[str]:
 
 
 def _short_names(neural: str) -> list[str]:
-    """Return the short names of a neural voice, such as "joe" and "en_US-joe" for "piper/en_US-joe-low".
+    """Return the short names of a neural voice, such as "joe" and "en_US-joe".
 
     They don't include the language alone.
     """
@@ -194,7 +194,7 @@ def neural_language(voice: str) -> str:
 
 
 def speaker_number(speaker: str, numbers: Mapping[str, int], count: int) -> int:
-    """Return the number of a speaker of a neural voice, given the speaker's name or number.
+    """Return the number of a speaker, given the speaker's name or number.
 
     Args:
         speaker: The name or number, or "" for the first speaker.
@@ -295,12 +295,12 @@ def _find_by_name(wanted: str, voices: Sequence[Voice]) -> Voice | None:
 
 
 def _fold(word: str) -> str:
-    """Normalize a name for comparisons: lower case, with dashes instead of underscores."""
+    """Normalize a name for comparisons."""
     return word.casefold().replace("_", "-")
 
 
 def _names_of(voice: Voice) -> tuple[str, str, str, str]:
-    """Return the names by which a voice can be found, in the order in which they are tried."""
+    """Return the names by which a voice can be found."""
     return voice.id, voice.id.rpartition("/")[2], voice.name, voice.language or ""
 
 

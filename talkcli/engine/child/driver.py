@@ -299,7 +299,7 @@ class Driver:
     destroy = stop
 
     def getProperty(self, name: str) -> Any:  # noqa: N802 - pyttsx3's name
-        """Return the list of voices, the ID of the current voice, or the value of a speech setting.
+        """Return the value of a property.
 
         Raises:
             KeyError: the property is unknown.

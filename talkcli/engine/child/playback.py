@@ -60,8 +60,8 @@ HOLD_SILENCE_LIMIT_S = 0.15
 #: How far the word clock may run ahead of the sound. Measurements show 4 to 8 ms.
 CLOCK_ERROR_S = 0.01
 
-#: If samples are late, the resulting silence counts as a gap only if it is longer than this. A shorter silence is
-#: inaudible, and the clock can't measure it precisely.
+#: The minimum length of a gap caused by late samples. A shorter silence is inaudible, and the clock can't measure it
+#: precisely.
 INAUDIBLE_GAP_S = 0.05
 
 #: How much sound to repeat after a player was killed with sound in its buffer. The clock isn't exact, so some sound
@@ -152,7 +152,7 @@ class PlayerFeed:
         self.consumed = 0
         #: number of bytes written to the player, including silence
         self.written = 0
-        #: time at which the player last accepted samples or had consumed everything
+        #: time at which the player last made progress
         self.progress_at = time.monotonic()
         self._rate = rate
         self._clock = clock
@@ -198,7 +198,7 @@ class PlayerFeed:
         """
         consumed = self.player.consumed()
         if consumed > self.consumed:
-            if self.consumed == 0:  # the device has just been opened; before that, samples wait in the player's pipe
+            if self.consumed == 0:  # until the device is open, samples wait in the player's pipe
                 self._clock.start(now)
             self.consumed = consumed
             if consumed >= self.written:  # consuming a few bytes now and then doesn't count as progress
@@ -264,7 +264,7 @@ class Playback:
         self._feed: PlayerFeed | None = None
         self._first_error: CannotSpeak | None = None
         self._clock = WordClock()
-        #: all samples so far; once the player is known to work, only those not heard yet
+        #: the samples; once the player is known to work, only those not heard yet
         self._samples = SentenceSamples()
         self._complete = False  # whether all samples were written
         self._begin = 0  # offset of the current player's first sample
@@ -510,7 +510,7 @@ class Playback:
         while not player.ended():
             self._update_progress(feed)
             now = time.monotonic()
-            # If less sound is left, it isn't worth killing the player, because it will finish anyway.
+            # If less sound is left, let the player finish.
             if self._runner.hold_number and feed.buffered(now) > HOLD_SILENCE_LIMIT_S:
                 self._release_and_rewind(feed)
                 raise _PlayerReleased
@@ -671,7 +671,7 @@ class Playback:
             self._wait()
 
     def _wait_for_player(self, feed: PlayerFeed, until: float, more: Interest | None = None) -> None:
-        """Wait until the player needs attention, a word is due or a time limit is reached.
+        """Wait until the player needs attention, a word is due or time is up.
 
         Args:
             feed: the stream of the player.

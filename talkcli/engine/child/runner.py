@@ -1,4 +1,4 @@
-"""The main loop of the engine process, which speaks goals through pyttsx3 and executes commands.
+"""The main loop of the engine process, which speaks goals and executes commands.
 
 The loop runs in one thread. While `talk`'s own driver speaks, it waits in `GoalRunner.wait`, which executes a `Stop` or
 `Hold` at once. Third-party drivers can't pause a sentence. They are stopped instead, and later speak the rest of the
@@ -156,7 +156,7 @@ class GoalRunner:
         pump: Callable[[], None] | None,
         synthesizer: CombinedSynthesizer | None,
     ) -> None:
-        """Set the pyttsx3 engine that speaks the goals, and subscribe to its notifications.
+        """Set the pyttsx3 engine that speaks the goals.
 
         Args:
             engine: pyttsx3's engine.
@@ -174,7 +174,7 @@ class GoalRunner:
         engine.connect("error", _with_traceback(self._record_error))
 
     def run(self, *, send_voices: bool) -> None:
-        """Speak goals and execute other commands until the server has closed the connection.
+        """Speak goals and execute commands until the server disconnects.
 
         Args:
             send_voices: whether to send the list of voices first.

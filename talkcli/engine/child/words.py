@@ -21,7 +21,7 @@ _END_MARKS = ".,;:!?…"
 
 
 def count_letters(text: str, start: int) -> int:
-    """Count the letters, digits and combining accents from `start` to the first other character.
+    """Count the letters, digits and combining accents that begin at `start`.
 
     It is used as the length of a word if libespeak-ng reports a length of 0. libespeak-ng does so if the next character
     isn't ASCII (as in "«hello»"), and also if there is no word at all.
@@ -33,7 +33,7 @@ def count_letters(text: str, start: int) -> int:
 
 
 class WordFinder:
-    """Finds whole words in a text, given the locations that a synthesizer reports.
+    """Finds whole words in a text from the locations that a synthesizer reports.
 
     Synthesizers repeat locations, go back, report blanks, return lengths that extend into the next word, and report
     only the first part of "it's". `find` returns each word at most once, in the order of the text. If two words are
@@ -67,7 +67,7 @@ class WordFinder:
         return start, self._end, self._count
 
     def _whole_end(self, start: int, end: int) -> int:
-        """Return the end of a whole word, given the start and end of its reported part."""
+        """Return the end of a word, given the reported part of it."""
         text = self._text
         if end == len(text) or text[end].isspace():
             return start + len(text[start:end].rstrip(_END_MARKS) or text[start:end])
@@ -109,7 +109,7 @@ class WordClock:
         self._waiting.append(word)
 
     def skip_until(self, position: float) -> None:
-        """Move all earlier words to this position, because the audio before it is skipped."""
+        """Move all earlier words to this position."""
         self._waiting = deque(replace(each, position=max(position, each.position)) for each in self._waiting)
 
     def reset(self, position: float) -> None:

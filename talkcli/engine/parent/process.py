@@ -236,7 +236,7 @@ class PrivateEngine(contextlib.AbstractContextManager["PrivateEngine"]):
         self.events = self._receive_events()
 
     def __exit__(self, *_: object) -> None:
-        """Kill the process and wait until it has exited, so that it can't write to its output file any more."""
+        """Kill the process, and wait until it has exited."""
         self._process.kill()
         wait_ready({self._process.liveness: select.POLLIN}, KILL_LIMIT_S)
         self._process.close()

@@ -198,7 +198,7 @@ def _convert_os_error(path: str, error: OSError) -> CannotWrite:
 
 
 def _display_name(path: str) -> str:
-    """Return the name of the output for messages, which is a path or "standard output"."""
+    """Return the name of the output for messages."""
     return "standard output" if path in STANDARD_OUTPUT else path
 
 
@@ -256,7 +256,7 @@ def _open_pipe_or_device(path: str, deadline: float, interrupt: Mapping[int, int
 
 @contextlib.contextmanager
 def _hidden_file(path: str) -> Iterator[str]:
-    """Create a hidden file, yield its path, and finally rename the file to `path`.
+    """Create a hidden file that finally replaces the file at `path`.
 
     After an error, remove it.
     """

@@ -209,7 +209,7 @@ class Supervisor:
         self._goal: SupervisedGoal | None = None
         #: ID of the neural voice that the process is loading
         self._loading: str | None = None
-        #: time of the last event from the process, or of a later command that the process must answer
+        #: time of the last event from the process, or of the last command that it must answer
         self._last_sign_at = 0.0
         #: killed processes that may not have exited yet, and the time by which they must have exited
         self._dying: dict[EngineProcess, float] = {}
@@ -308,7 +308,7 @@ class Supervisor:
         return min([*deadlines, NEVER if self._process else self._restarts.next_start_at])
 
     def _deadlines(self) -> Iterator[tuple[float, str]]:
-        """Yield the current deadlines, each with the error message to report if it is missed."""
+        """Yield the current deadlines, each with an error message."""
         goal, no_sign = self._goal, f"the engine did not respond for {HANG_LIMIT_S:g} s"
         if self._process and not self._process.ready:
             yield self._started_at + START_LIMIT_S, f"the engine was not ready within {START_LIMIT_S:g} s"
@@ -334,7 +334,7 @@ class Supervisor:
                 self._fail_goal(self._goal, Reason.NOT_SILENT, message)
 
     def _handle_ready(self, process: EngineProcess, descriptor: int) -> None:
-        """Handle a readable descriptor of a process: its exit, its standard error or its messages."""
+        """Handle a readable descriptor of a process."""
         if descriptor == process.liveness:
             if process is self._process:
                 self._receive(process)  # read the last messages of the process before handling its death
@@ -365,7 +365,7 @@ class Supervisor:
             self._send_waiting_goal()
 
     def _send_waiting_goal(self) -> None:
-        """Send the current goal to the process, if the goal is waiting and the process is ready."""
+        """Send the waiting goal to the process if both are ready."""
         goal = self._goal
         if goal and not (goal.sent or goal.hold_number or goal.end):
             self._last_sign_at = time.monotonic()
@@ -458,7 +458,7 @@ class Supervisor:
         self._watched |= dict.fromkeys((process.socket.fileno(), process.liveness, process.stderr), process)
 
     def _report_stderr(self, line: str) -> None:
-        """Post a line from a process's standard error, unless there were too many lines recently."""
+        """Post a line of a process's standard error, unless there are too many."""
         omitted = self._stderr_quota.count_event(time.monotonic())
         if omitted:
             self._post(EngineSaid(f"({omitted} lines were omitted)"))
@@ -565,7 +565,7 @@ class Supervisor:
             self._post(EngineMissing(message))
 
     def _release_process(self, process: EngineProcess) -> None:
-        """Release a process that has exited, and end the goal that was waiting for its exit."""
+        """Release a process that has exited, and end its goal."""
         del self._watched[process.liveness]
         if self._watched.pop(process.stderr, None):
             process.read_stderr()

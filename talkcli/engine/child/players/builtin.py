@@ -1,4 +1,4 @@
-"""Players that need neither a program nor a sound server: "null", "file:PATH", and `talk say --output`."""
+"""Players that need neither a program nor a sound server."""
 
 from __future__ import annotations
 
@@ -102,11 +102,11 @@ class NullPlayer(BuiltInPlayer):
         return len(data)
 
     def ended(self) -> bool:
-        """Return whether the player was closed and all accepted samples would have been heard."""
+        """Return whether the player was closed and its simulated buffer is empty."""
         return self._closed and self._clock() >= self._end_time
 
     def wake_at(self) -> float:
-        """Return the time at which the simulated buffer has room or, after `close`, is empty."""
+        """Return when the simulated buffer has room or, after `close`, is empty."""
         # At this time, a third of the buffer is free, so this player wakes up no more often than a real one.
         return self._end_time if self._closed else self._end_time - NULL_AHEAD_S * 2 / 3
 

@@ -70,7 +70,7 @@ class HandoverTimes:
         return self._previous is not None
 
     def silence_to_cut(self, player_name: str) -> float:
-        """Return how many seconds of silence to cut from the end of a sentence with this player."""
+        """Return how many seconds of silence to cut from the end of a sentence."""
         measured = sorted(self._measured.get((player_name, self.next_is_neural), ()))
         return min(MAX_CUT_S, measured[len(measured) // 2]) if measured else 0.0
 
@@ -173,7 +173,7 @@ class PlayerChooser:
         return milliseconds / 1000 if due else 0.0
 
     def find_first_player(self) -> str | None:
-        """Return the name of the player that would be tried first, or None if there is no player.
+        """Return the name of the player that would be tried first.
 
         To test the players that run in this process, open and close them.
         """

@@ -205,7 +205,7 @@ class ErrorOutput:
         self._first: str | None = None
 
     def feed(self, data: bytes) -> None:
-        """Look for an error message in bytes that the program wrote to standard error."""
+        """Look for an error message in the program's error output."""
         for line in self._lines.feed(data):
             self._examine_line(line)
 
@@ -218,7 +218,7 @@ class ErrorOutput:
         return self._error or self._first
 
     def _examine_line(self, raw: bytes) -> None:
-        """Store a line if it is the first one, or the first that looks like an error.
+        """Store a line if it is the first one or the first error.
 
         Ignore noise.
         """
@@ -232,7 +232,7 @@ class ErrorOutput:
 
 
 class ProgramPlayer(Player):
-    """Plays a sentence by writing its samples to the standard input of an external program."""
+    """Plays a sentence through the standard input of a program."""
 
     real_time = True
 
@@ -346,7 +346,7 @@ class ProgramPlayer(Player):
         return written
 
     def _exit_error(self, status: int) -> CannotSpeak:
-        """Return the error for a program that exited too early or with an error status."""
+        """Return the error for a program that exited too early or failed."""
         self.consumed()
         line = self._errors.find_error()
         if status < 0:

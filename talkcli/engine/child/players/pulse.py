@@ -1,4 +1,4 @@
-"""The player "pulse", which sends its samples directly to the sound server (PulseAudio or PipeWire).
+"""The player "pulse", which sends its samples directly to the sound server.
 
 Each sentence has a connection and a stream of its own. Opening both takes 1 ms, while starting a program takes 9 ms.
 The server reports more than a program could: when the stream started, whether it was moved, suspended or killed, how
@@ -138,12 +138,12 @@ class PulsePlayer(Player):
         return length
 
     def consumed(self) -> int:
-        """Return the number of bytes that have been heard according to the server's clock."""
+        """Return the number of bytes heard so far, by the server's clock."""
         self.heard()
         return self._heard
 
     def heard(self) -> float | None:
-        """Return how many seconds of the stream have been heard according to the server's clock."""
+        """Return the number of seconds heard so far, by the server's clock."""
         if self._drained:
             self._heard = self._written
         elif self._clock_report is not None:
@@ -356,7 +356,7 @@ class PulsePlayer(Player):
         self._clock_report, self._time_request_at = None, 0.0
 
     def _record_failure(self) -> None:
-        """Record that the stream has failed, with a message for libpulse's error number."""
+        """Record that the stream has failed, and why."""
         if self._error is not None:
             return
         reason = Reason.AUDIO_DEVICE if self._written == 0 else Reason.AUDIO_LOST
@@ -398,7 +398,7 @@ class PulsePlayer(Player):
             self._time_request_at = now + TIME_REQUEST_S
 
     def _on_drained(self, _stream: int, success: int, _data: object) -> None:
-        """Record that the server has played the whole stream, or that the stream has failed."""
+        """Record whether the server has played the whole stream."""
         if not success:
             self._record_failure()
             return
@@ -417,7 +417,7 @@ class PulsePlayer(Player):
             self._level_refused = True
 
     def _on_stream(self, _context: int, found: Any, end: int, _data: object) -> None:
-        """Store the volume and mute state of the stream, as reported by the server."""
+        """Store the volume and mute state that the server reports for the stream."""
         self._pending_levels -= end != 0
         if end == 0:
             self._stream_level = Level(libpulse.loudest(found[0].volume), bool(found[0].mute))

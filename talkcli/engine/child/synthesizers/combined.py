@@ -76,7 +76,7 @@ class CombinedSynthesizer:
 
     @property
     def loader(self) -> ModelLoader | None:
-        """The object that loads neural voices, or None if no neural voice has been requested yet."""
+        """The model loader, or None if no neural voice has been requested yet."""
         return self._neural.loader if self._neural else None
 
     def carry_out(self, command: LoadVoice | DropVoice) -> None:

@@ -237,7 +237,7 @@ class Espeak:
             raise CannotSpeak(Reason.ENGINE_FAILED, f"espeak_Synth failed with {status}")
 
     def load_language(self, language: str) -> None:
-        """Load a voice for a language code such as "de-at" or, if there is none, for "de" or English."""
+        """Load the best voice for a language code such as "de-at"."""
         self._stop_phonemizer()
         found = (self._find_voice(each) for each in (language, language.partition("-")[0], *_ENGLISH))
         self.load(next((each.id for each in found if each), self.voice))
@@ -272,7 +272,7 @@ class Espeak:
         return find_voice(word, self._listed)
 
     def _stop_phonemizer(self) -> None:
-        """Wait for the last phonemizer to finish, and switch back to the synthesizer's voice."""
+        """Wait for the last phonemizer to finish, and restore the synthesizer's voice."""
         phonemizer, self._phonemizer = self._phonemizer, None
         if phonemizer is not None:
             with phonemizer.busy:  # The phonemizer's last call may still be running.
@@ -339,7 +339,7 @@ class EspeakPhonemizer:
         return positions
 
     def ends_with_abbreviation(self, clause: str) -> bool:
-        """Return whether a clause ends with an abbreviation such as "Mr.", after which the library makes no pause."""
+        """Return whether a clause ends with an abbreviation such as "Mr."."""
         word = clause.rsplit(maxsplit=1)[-1]
         _, alone = self._speak_silently(word)
         _, with_pause = self._speak_silently(f"{word} A")
@@ -378,7 +378,7 @@ class EspeakPhonemizer:
                     positions.append(position)
                 elif event.type == self._espeak.EVENT_END:
                     clause_ends.append(event.sample)
-            return int(self._ended)  # 1 stops the synthesis
+            return int(self._ended)  # returning 1 stops the synthesis
 
         with self._library_call():
             self._espeak.SetSynthCallback(on_audio)

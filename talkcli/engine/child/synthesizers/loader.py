@@ -136,7 +136,7 @@ class ModelLoader:
 
     @property
     def descriptor(self) -> int | None:
-        """A file descriptor that becomes readable when the load has finished, or None if no voice is being loaded."""
+        """A descriptor that becomes readable when the load has finished."""
         return self._load.descriptor if self._load else None
 
     @property

@@ -1,4 +1,4 @@
-"""Functions that split a text into sentences for a neural voice, and convert them to phonemes.
+"""Functions that split a text into sentences and convert them to phonemes.
 
 libespeak-ng returns the phonemes of each clause with blanks between words. When it speaks the clause, it reports the
 positions of the words in the text. These two lists have to be aligned, because the phonemes of some words are joined
@@ -67,7 +67,7 @@ class Phonemizer(Protocol):
 
 @frozen
 class SpeechPart:
-    """The phonemes of a sentence, or of a part of a long sentence, for one run of a model."""
+    """The phonemes of a sentence, or of a part of a long one."""
 
     #: IPA characters, blanks and punctuation marks; never empty
     phonemes: tuple[str, ...]

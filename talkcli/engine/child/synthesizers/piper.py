@@ -59,11 +59,10 @@ _SPEECH_LEVEL = 0.001
 _WRITE_S = 0.1
 _FULL_SCALE = 32767
 _DEFAULT_PITCH = 50
-#: The rate of libespeak-ng at which it is as fast as Piper's voices at their natural pace, and the share of the
-#: speaking time that doesn't depend on the rate, because durations are rounded up to whole frames. Both values were
-#: fitted to five sentences, spoken by libespeak-ng 1.51 (gmw/en-US) at 80 to 450 words per minute, and by
-#: en_US-joe-medium at scales of 0.2 to 2.2. From 120 to 400 words per minute, the durations agree within 5 %. At 80 and
-#: 450, the model is 11 and 13 % slower.
+#: The rate at which libespeak-ng is as fast as Piper's voices at their natural pace, and the share of the speaking time
+#: that doesn't depend on the rate. Both values were fitted to five sentences, spoken by libespeak-ng 1.51 (gmw/en-US)
+#: at 80 to 450 words per minute, and by en_US-joe-medium at scales of 0.2 to 2.2. From 120 to 400 words per minute, the
+#: durations agree within 5 %. At 80 and 450, the model is 11 and 13 % slower.
 _NATURAL_WPM, _CONSTANT_SHARE = 195, 0.30
 _MIN_SCALE = 0.1
 
@@ -292,7 +291,7 @@ def _phoneme_ids(phonemes: Sequence[str], ids: Mapping[str, tuple[int, ...]]) ->
 
 
 def _duration_scale(rate: int) -> float:
-    """Convert a rate in words per minute to a factor for the durations of all phonemes.
+    """Convert a rate in words per minute to a factor for all durations.
 
     The factor makes a sentence take as long as with libespeak-ng. Above 400 words per minute, the model is slower,
     because no phoneme can be shorter than a frame.

@@ -1,4 +1,4 @@
-"""Functions to split the model of a Piper voice (VITS, in ONNX format) into an encoder and a decoder.
+"""Functions to split the model of a Piper voice into an encoder and a decoder.
 
 The encoder turns phoneme ids into frames, and the decoder turns frames into samples. Each sample depends only on nearby
 frames, so the decoder can process a few frames at a time. The encoder also outputs how many frames each phoneme id
@@ -130,7 +130,7 @@ class _Reader:
 
 
 class _Node:
-    """An operation in a graph. Its inputs include those of the graphs nested in it."""
+    """An operation in a graph. Its inputs include those of nested graphs."""
 
     def __init__(self, reader: _Reader, raw: Buffer, depth: int) -> None:
         fields = reader.fields(raw)
@@ -186,7 +186,7 @@ class _Graph:
         return found[::-1]
 
     def constants(self) -> set[str]:
-        """Return the names of the values that don't depend on the inputs and aren't random."""
+        """Return the names of the values that are the same in every run."""
         names = {*self._weights, ""}
         for node in self.nodes:
             if names.issuperset(node.inputs) and not node.operator.startswith(_RANDOM_PREFIX):
@@ -244,7 +244,7 @@ def _names(fields: Iterable[Field], field_number: int) -> list[str]:
 
 
 def _parse_integer(raw: Buffer, at: int) -> tuple[int, int]:
-    """Decode the integer at an index, and return it with the index of the next byte."""
+    """Decode an integer, and return it with the index of the next byte."""
     result = shift = 0
     while at < len(raw) and shift < 64:  # Longer integers aren't valid.
         byte = raw[at]
