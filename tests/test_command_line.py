@@ -157,7 +157,7 @@ def test_an_empty_socket_option_is_refused(scripted: Talk, local: dict[str, str]
     for arguments in (["--socket", "", "say", "hello"], ["--socket=", "cancel"], ["serve", "--socket", ""]):
         done = run([*TALK, *arguments], local)
         assert (done.code, done.out) == (2, "")
-        assert "--socket: must not be empty; check the variable that it comes from" in done.err
+        assert "--socket: must not be empty; check the variable that should contain the value" in done.err
     assert scripted.watcher.goals() == []
 
 
@@ -190,7 +190,7 @@ def test_arguments_and_output_are_utf8_in_every_locale(scripted: Talk) -> None:
     done = run([*TALK, *arguments], {**scripted.env, **ascii_only})
     assert (done.code, done.err) == (
         0,
-        "talk: line 1, column 11: the byte 0xff is not valid UTF-8, so it is not spoken\n",
+        "talk: line 1, column 11: the byte 0xff is not valid UTF-8 and is skipped\n",
     )
     goal = scripted.goal(done.out.strip())
     assert (goal["text"], goal["key"], goal["client"]["name"]) == ("length=0 a\ufffd b é", "日", "é")

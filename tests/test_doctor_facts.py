@@ -136,7 +136,7 @@ def test_a_wrong_talk_socket_is_reported_with_the_running_server(home: str) -> N
     with serving(environment(home, XDG_RUNTIME_DIR=f"{home}/run")):
         finding = no_server(f"{home}/wrong")
     assert f"TALK_SOCKET names {home}/wrong: not found" in finding.message
-    assert finding.next == f"unset TALK_SOCKET: a server is running on {home}/run/talk/talk.sock"
+    assert finding.next == f"unset TALK_SOCKET, because a server is running on {home}/run/talk/talk.sock"
 
 
 @pytest.mark.usefixtures("nobody_serves")
@@ -274,7 +274,7 @@ def test_a_device_is_looked_up_in_its_players_list(tmp_path: Path) -> None:
     for wanted in ("default", "plughw:1,0"):
         assert sound.check_device(env, "aplay", wanted).state == OK
     finding = sound.check_device(env, "aplay", "robot_speaker")
-    assert (finding.state, "robot_speaker is not in the list of aplay -L" in finding.message) == (WARNING, True)
+    assert (finding.state, "robot_speaker is not a device that aplay -L lists" in finding.message) == (WARNING, True)
     assert "plughw:CARD=Device,DEV=0" in finding.message
     assert sound.check_device(env, "pacat", None).state == OK, "it is a fault only if a device is given"
     finding = sound.check_device(env, "pacat", "usb")

@@ -68,7 +68,7 @@ def test_the_voice_in_use_is_loaded_and_timed(alone: dict[str, str]) -> None:
     assert checks["neural"]["state"] == "ok"
     assert re.search(r"onnxruntime \d+\.\d+.*, numpy \d+\.\d+", checks["neural"]["message"])
     assert checks["voice files"] == {
-        "check": "voice files", "state": "ok", "message": "complete and safe: piper/tiny", "next": None
+        "check": "voice files", "state": "ok", "message": "the files of piper/tiny are complete and safe", "next": None
     }  # fmt: skip
     assert checks["neural voice"]["state"] == "ok"
     assert re.match(f"piper/ti {TRIED}", checks["neural voice"]["message"]), checks
@@ -256,7 +256,7 @@ def test_the_servers_status_is_reported_if_voices_cannot_be_examined() -> None:
     (finding,) = voice.judge_server_voices(SERVER_VOICES)
     assert finding.state == WARNING
     assert finding.message == "the server cannot speak with the voice piper/b: x is no model"
-    assert finding.next == "check whether this is still true: talk set --voice piper/b"
+    assert finding.next == "try to load the voice again: talk set --voice piper/b"
     (finding,) = voice.judge_server_voices({"piper/a": SERVER_VOICES["piper/a"]})
     assert (finding.state, finding.message) == (OK, "the server's neural voices: piper/a")
     assert voice.judge_server_voices({}) == []

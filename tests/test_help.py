@@ -209,7 +209,7 @@ def test_without_a_player_the_log_names_packages_to_install(make_talk: MakeTalk,
 
 def test_an_output_file_of_another_format_is_refused(tmp_path: pathlib.Path) -> None:
     done = alone("say", "-o", str(tmp_path / "hello.MP3"), "hello")
-    assert (done.code, "--output writes WAV, not .MP3; name the file .wav" in done.err) == (2, True)
+    assert (done.code, "--output can only write WAV files; name the file .wav" in done.err) == (2, True)
     assert not list(tmp_path.iterdir())
 
 

@@ -157,7 +157,7 @@ def test_a_refused_client_of_another_user_exits_with_10(home: str) -> None:
             done = run([*client, "--socket", path, *arguments], other_user)
             assert (done.code, done.out) == (10, ""), done
             assert "Traceback" not in done.err
-            assert "its owner can let you in with: talk serve --socket-mode 0660" in done.err
+            assert "ask its owner to run: talk serve --socket-mode 0660" in done.err
             assert done.err.endswith("or start your own server with: talk serve\n")
         done = run([*client, "status"], {**other_user, "TALK_SOCKET": path})
         assert done.err.endswith("or unset TALK_SOCKET to try the usual places\n")

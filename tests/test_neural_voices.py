@@ -173,7 +173,7 @@ def test_espeak_speaks_urgent_goals_while_their_voice_is_loading(env: dict[str, 
         for urgent in ({"preempt": True}, {"flush": True}, {"priority": 1}, {"ttl": 0.2}):
             goal = robot.say("hello", **urgent)
             assert robot.heard(goal) == ("SUCCEEDED", INSTEAD)
-            assert f"{goal.id} is spoken by {INSTEAD} instead: piper/tiny is not loaded" in robot.server.log
+            assert f"{goal.id} is spoken with the voice {INSTEAD} instead: piper/tiny is not loaded" in robot.server.log
         assert f"voice    {INSTEAD}" in run([*TALK, "status", goal.id], env).out
         late, insists = robot.say(voice_only=True, ttl=0.5), robot.say("x", voice_only=True, priority=1)
         assert late.wait(LIMIT).reason == "expired"
@@ -218,7 +218,10 @@ def test_espeak_replaces_a_broken_voice_until_it_is_repaired(env: dict[str, str]
         assert robot.heard(robot.say("hello", None)) == ("SUCCEEDED", INSTEAD)
         assert robot.neural(BROKEN) == {"state": "failed", "why": why}
         assert f"{BROKEN} failed: " in run([*TALK, "status"], env).out
-        assert f"voice {BROKEN} can't be loaded, so espeak speaks (except with --voice-only): {why}" in robot.server.log
+        assert (
+            f"voice {BROKEN} can't be loaded, so espeak is used instead (except with --voice-only): {why}"
+            in robot.server.log
+        )
         done = run([*TALK, "--json", "say", "--wait", "--voice-only", "hello"], env)
         goal = json.loads(done.out)
         assert (done.code, goal["reason"], goal["message"]) == (4, "voice_failed", f"speech failed: {why}")
@@ -311,7 +314,7 @@ def test_espeak_speaks_if_the_files_of_a_voice_are_missing(env: dict[str, str], 
         goal = robot.say("hello", None)
         state, voice = robot.heard(goal)
         assert state == "SUCCEEDED"
-        assert f'{goal.id} is spoken by {voice} instead: unknown voice "piper/tiny"' in robot.server.log
+        assert f'{goal.id} is spoken with the voice {voice} instead: unknown voice "piper/tiny"' in robot.server.log
 
 
 def test_goals_fail_at_once_if_the_engine_cannot_start(env: dict[str, str], tmp_path: Path) -> None:

@@ -125,9 +125,9 @@ def test_a_line_with_invalid_utf8_is_reported_and_spoken(scripted: Talk) -> None
     )
     assert (done.returncode, len(done.stdout.split())) == (0, 4)
     assert done.stderr.decode().splitlines() == [
-        "talk: line 3, column 11: the byte 0xff is not valid UTF-8, so it is not spoken (1 more like it)",
-        "talk: line 4, column 1: the byte 0xff is not valid UTF-8, so it is not spoken",
-        "talk: line 5, column 15: the byte 0xc3 is not valid UTF-8, so it is not spoken",
+        "talk: line 3, column 11: the byte 0xff is not valid UTF-8 and is skipped (1 more like it)",
+        "talk: line 4, column 1: the byte 0xff is not valid UTF-8 and is skipped",
+        "talk: line 5, column 15: the byte 0xc3 is not valid UTF-8 and is skipped",
     ]
     texts = ["length=0 one", "length=0 t\ufffdw\ufffdo", "\ufffd", "length=0 three\ufffd"]
     assert scripted.watcher.texts("ACTIVE")[:4] == texts

@@ -33,14 +33,14 @@ _SINGLE_ROBOT_OPTIONS = ("lines", "ahead", "feedback", "output")
 
 #: All exit codes, for `talk --help`. The help of some commands describes them more specifically.
 ALL_EXIT_CODES: ExitCodes = {
-    0: "the goal was accepted; with --wait: all of it was played",
+    0: "the goal was accepted; with --wait: it was played to the end",
     1: "any other error; if it is a bug in talk, TALK_DEBUG=1 prints a traceback",
     2: "wrong usage",
     3: "no server, no broker, or the robot is offline; nothing was spoken, so you can try again",
     4: "aborted: the engine or the sound failed, or the text can't be spoken",
     5: "rejected: the goal was never queued (bad text, full queue, too many clients)",
     6: "recalled: the goal was removed from the queue before it was spoken",
-    7: "preempted: the goal was stopped while it was spoken",
+    7: "preempted: the goal was stopped while it was being spoken",
     8: "unknown goal",
     9: "client and server use different versions of the protocol",
     10: "permission denied",
@@ -93,9 +93,7 @@ class Command:
         """
         robot, socket, connect_timeout = (common.get(each) for each in ("robot", "socket", "connect_timeout"))
         if robot is not None and socket:
-            return (
-                "--robot names a robot of a fleet, but --socket names a server of this machine; leave out one of them"
-            )
+            return "--robot and --socket can't be combined; leave out one of them"
         is_local = self._is_local(given)
         local_name = f"{self.name}{' --output' * (given.get('output') is not None)}"
         if is_local and robot is not None:
@@ -165,14 +163,14 @@ COMMON_OPTIONS = (
     option(
         "--socket",
         PATH,
-        "Set the path of the server's socket.  [env var: TALK_SOCKET; default: the usual places, see 'talk doctor']",
+        "Set the path of the server's socket.  [env var: TALK_SOCKET; default: search the usual places]",
         completion="files",
     ),
     option(
         "--robot",
         WORD,
-        "Use a robot of a fleet, through the broker TALK_BROKER. A pattern, @GROUP or @all selects several robots.  "
-        "[env var: TALK_ROBOT]",
+        "Send the command to this robot of a fleet, through the broker TALK_BROKER. A pattern, @GROUP or @all selects "
+        "several robots.  [env var: TALK_ROBOT]",
         metavar="NAME",
         completion="robots",
     ),
@@ -185,7 +183,7 @@ COMMON_OPTIONS = (
         metavar="SEC",
     ),
     option("--insecure", FLAG, "Send the password to the broker without TLS."),
-    option("--json", FLAG, "Print JSON objects, one per line, also for errors."),
+    option("--json", FLAG, "Print results and errors as JSON objects, one per line."),
     option("-q, --quiet", FLAG, "Print errors only."),
 )
 
@@ -215,7 +213,7 @@ def read_value(option: Option, text: str) -> Any:
     if option.choices and text not in option.choices:
         raise ValueError(f"must be one of {', '.join(option.choices)}, got '{text}'")
     if not text and kind in (WORD, ID, PATH):  # an empty value usually comes from an unset variable
-        raise ValueError("must not be empty; check the variable that it comes from")
+        raise ValueError("must not be empty; check the variable that should contain the value")
     return text
 
 
@@ -283,9 +281,7 @@ def replace_bad_bytes(text: str, first_line: int = 1) -> tuple[str, str | None]:
     first = found[0]
     line = first_line + text.count("\n", 0, first)
     column = first - text.rfind("\n", 0, first)
-    words = (
-        f"line {line}, column {column}: the byte {_format_byte(text[first])} is not valid UTF-8, so it is not spoken"
-    )
+    words = f"line {line}, column {column}: the byte {_format_byte(text[first])} is not valid UTF-8 and is skipped"
     if len(found) > 1:
         words += f" ({len(found) - 1:,} more like it)"
     # The engine treats the replacement character U+FFFD as a space.

@@ -162,9 +162,9 @@ def _print_unit(
     if hidden:
         file, directory = hidden
         note(
-            f"the service's user can't enter {printable(directory)}, but this talk needs {printable(file)}; install "
+            f"talk needs {printable(file)}, but the service's user can't enter {printable(directory)}; install "
             "talk for all users with 'sudo /usr/bin/python3 -m venv /opt/talk && sudo /opt/talk/bin/pip install .' in "
-            "a checkout, and print the unit with that talk"
+            "a checkout, and print the unit with /opt/talk/bin/talk"
         )
     return EXIT_OK
 

@@ -40,7 +40,7 @@ ANSWER_LIMIT_S = 5.0
 RETRY_PAUSE_S = (0.02, 0.2)
 #: Advice for users who can't connect to a server.
 _START_STEP = "start one with: talk serve"
-_LET_IN_STEP = "its owner can let you in with: talk serve --socket-mode 0660 (if you are in the socket's group)"
+_LET_IN_STEP = "ask its owner to run: talk serve --socket-mode 0660 (this admits the socket's group)"
 _START_OWN_STEP = "or start your own server with: talk serve"
 
 

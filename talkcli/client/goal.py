@@ -120,7 +120,9 @@ class GoalHandle(TrackedGoal):
             UsageError: the goal was sent with `follow=False`, and neither `wait` nor `events` has been called.
         """
         if self._followed_at is None and not self.state.terminal:
-            raise UsageError(f"goal {self.id} was sent with follow=False; leave that out to get its events")
+            raise UsageError(
+                f"goal {self.id} was sent with follow=False; to get the goal's events, leave out follow=False"
+            )
         since = None if self.state.terminal else self._followed_at
         self._connection.wait_until(lambda: False, time.monotonic(), since=since, interruptible=False)
         if not self._has_event():

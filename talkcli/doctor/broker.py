@@ -177,7 +177,11 @@ class BrokerExamination:
         except TalkError:
             return ok("anonymous", "the broker rejects clients without credentials")
         words = "the broker accepts clients without credentials: anybody on the network can make the robots speak"
-        return warning("anonymous", words, "allow_anonymous false in mosquitto.conf; then: talk bridge --print-acl")
+        return warning(
+            "anonymous",
+            words,
+            "set allow_anonymous false in mosquitto.conf, and add access rules: talk bridge --print-acl",
+        )
 
     def _test_rights(self, link: Link, user: str) -> tuple[Finding, dict[str, Presence]]:
         """Test the user's access rights by publishing messages.
@@ -355,8 +359,8 @@ def _advise_on_tls_error(broker: Broker, message: str, code: int, now: float) ->
         return "log in with a certificate that the broker accepts: set TALK_MQTT_CERT and TALK_MQTT_KEY"
     if not code:
         return f"if port {broker.port} of {broker.host} has no TLS, use its TLS port in {URL}; otherwise, {_LOG_STEP}"
-    other = "another file," if broker.ca else "the file"
-    return f"name {other} of the CA that issued the certificate of {broker.host}: {CA}=FILE"
+    file = "another file" if broker.ca else "a file"
+    return f"set {CA} to {file} with the certificate of the CA that issued the certificate of {broker.host}"
 
 
 def judge_login(broker: Broker, refusal: str | None) -> Finding:
@@ -437,7 +441,7 @@ def judge_rights(user: str, unwritable: tuple[str, ...], unreadable: tuple[str, 
         return failure("rights", words, "add the missing lines to the broker's acl_file: talk bridge --print-acl")
     if error is not None:
         return failure("rights", f"the rights of '{user}' could not be tested: {error}", _LOG_STEP)
-    return ok("rights", f"the broker allows '{user}' everything that is needed")
+    return ok("rights", f"the broker gives '{user}' all the rights that are needed")
 
 
 def judge_server_status(robot: str, server: JsonObject, answer_s: float) -> Finding:

@@ -57,10 +57,12 @@ ADVICE: dict[str, str] = {
 SENTENCE_ELSEWHERE = failure(
     _SENTENCE_CHECK,
     "not played: the server and its player run on another machine or in a container",
-    "run talk doctor --silent there, or run it here without --silent, so that the server plays",
+    "run 'talk doctor --silent' there, or run 'talk doctor' here, so that the server plays a sentence",
 )
 #: Advice if the player of another user's server failed. The doctor can't use that server's environment.
-RUN_AS_OWNER = "run it as the server's user, whose sound settings may differ: sudo -u '#{}' talk doctor --silent"
+RUN_AS_OWNER = (
+    "run talk doctor as the server's user, whose sound settings may differ: sudo -u '#{}' talk doctor --silent"
+)
 _BUSY_STEP = "another program uses the device: close it, or play through a sound server (PipeWire, PulseAudio)"
 _PLAYER_REASONS = {Reason.AUDIO_DEVICE, Reason.AUDIO_LOST, Reason.AUDIO_STALLED}
 _START_REASONS = {Reason.ENGINE_FAILED, Reason.ENGINE_HUNG}
@@ -122,7 +124,9 @@ def _cancel_late_goal(client: Client, goal: GoalHandle, limit: float) -> Sentenc
     if before.server.get("paused") is True:
         return SentenceResult(ended.state, "paused", "not spoken: speech is paused")
     if goal.id not in pending:
-        return SentenceResult(ended.state, "late", f"cancelled, because it had not ended after {limit:g} s")
+        return SentenceResult(
+            ended.state, "late", f"the sentence was cancelled, because it had not ended after {limit:g} s"
+        )
     ahead = pending.index(goal.id) + bool(before.active)
     goals = "1 goal" if ahead == 1 else f"{ahead} goals"
     return SentenceResult(ended.state, "late", f"not spoken: it was still waiting behind {goals} after {limit:g} s")
@@ -167,7 +171,7 @@ def speak_by_engine(text: str, options: EngineOptions, volume: float, limit: flo
     except EngineFailed as error:
         return SentenceResult(State.ABORTED, *explain_failure(error))
     except TimeoutError:
-        return SentenceResult(State.ABORTED, Reason.ENGINE_HUNG, f"it did not end within {limit:g} s")
+        return SentenceResult(State.ABORTED, Reason.ENGINE_HUNG, f"the sentence did not end within {limit:g} s")
 
 
 def find_playback_step(findings: Sequence[Finding], *, custom: bool = False) -> str | None:
@@ -201,7 +205,7 @@ def advise(
     if reason == Reason.AUDIO_DEVICE and "busy" in said:
         return _BUSY_STEP
     if reason == Reason.AUDIO_DEVICE and ("denied" in said or "not permitted" in said):
-        return "for the server's user: sudo usermod -aG audio USER; then log in again, and restart the server"
+        return "give the server's user access: sudo usermod -aG audio USER; then log in again, and restart the server"
     if reason == Reason.NO_PLAYER and player == "pulse":
         return "start PulseAudio or PipeWire, or use ALSA: talk serve --player aplay"
     if reason == Reason.ENGINE_FAILED and "libespeak-ng is missing" in message:
@@ -209,7 +213,7 @@ def advise(
     if reason in _PLAYER_REASONS and isinstance(player, str) and is_custom(player):
         command = player.replace("{rate}", "22050").replace("{device}", str(device or "default"))
         return f"test the player with a second of silence: head -c 44100 /dev/zero | {command}"
-    return ADVICE.get(reason or "", "another client ended it: run talk doctor again")
+    return ADVICE.get(reason or "", "another client ended the sentence: run talk doctor again")
 
 
 def judge_sentence(
@@ -226,12 +230,14 @@ def judge_sentence(
     """
     if result.state is State.SUCCEEDED and result.muted_device:
         step = ADVICE[Reason.MUTED].replace("@DEFAULT_SINK@", result.muted_device)
-        return failure(_SENTENCE_CHECK, f"it was played, but the output {result.muted_device} was muted", step)
+        return failure(
+            _SENTENCE_CHECK, f"the sentence was played, but the output {result.muted_device} was muted", step
+        )
     if result.state is State.SUCCEEDED:
         how = "through the server" if result.by_server else "by talk doctor's own engine"
         seconds = "" if result.duration is None else f", {result.duration:.1f} s"
         player = f", {result.player}" if result.player else ""
-        said = "a sentence was played without sound" if silent else f'"{SENTENCE_TEXT}" was played to its end'
+        said = "a sentence was played without sound" if silent else f'"{SENTENCE_TEXT}" was played to the end'
         return ok(_SENTENCE_CHECK, f"{said} {how}{player}{seconds}")
     if result.reason in {"late", "paused"}:
         return failure(_SENTENCE_CHECK, result.message or "", ADVICE[result.reason])

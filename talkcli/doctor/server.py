@@ -47,14 +47,14 @@ PLACE_STOPPED = "a stopped process is listening"
 #: Advice if the server refuses the client, by error code.
 _REFUSAL_ADVICE = {
     "protocol_mismatch": "install the same version of talk for the server and its clients, and restart the server",
-    "busy": "end some of its clients, or raise the limit in the message: talk serve --max-clients 512, or LimitNOFILE=",
+    "busy": "end some clients, or raise the limit named above: talk serve --max-clients 512, or LimitNOFILE=",
     "permission_denied": "ask its owner for access: talk serve --socket-mode 0660, and join the socket's group",
 }
 #: Advice for each kind of place. If several kinds were found, the first one in this table counts.
 _PLACE_ADVICE = {
     PLACE_FORBIDDEN: "ask {whose} for access: talk serve --socket-mode 0660, and join the socket's group; "
     "or start your own server",
-    PLACE_FOREIGN: "remove it, and run: talk serve; or if you trust uid {uid}, run: talk --socket {path} doctor",
+    PLACE_FOREIGN: "remove {path}, and run: talk serve; or if you trust uid {uid}, run: talk --socket {path} doctor",
     PLACE_STOPPED: "continue the process: kill -CONT {pid}",
     PLACE_LISTENING: "restart the server on {path}; if the socket isn't talk's, remove it",
     PLACE_FILE: "remove {path}, and run: talk serve",
@@ -202,7 +202,7 @@ def _advise_on_missing_server(places: list[SocketPlace], named_by: str | None, c
     """
     for each in paths.client_sockets(None) if named_by else []:
         if _probe_path(each, set()).what == PLACE_LISTENING:
-            return f"{_UNNAMING[named_by]}: a server is running on {each}"
+            return f"{_UNNAMING[named_by]}, because a server is running on {each}"
     place = next((each for what in _PLACE_ADVICE for each in places if each.what == what), None)
     if place is None:  # a new server could start at any of the places
         # Only root can see the sockets of all users.

@@ -452,7 +452,7 @@ def judge_session(session: UserSession) -> Finding:
     if session.runtime_dir is None:
         if session.usual_runtime_dir is None:
             # This is normal on robots without logind, which would create the directory.
-            return ok("session", f"{who}; no XDG_RUNTIME_DIR, because this user has no login session")
+            return ok("session", f"{who}; XDG_RUNTIME_DIR is not set, because this user has no login session")
         again = "" if session.server_pid is None else " for the server, and restart it"
         return warning(
             "session",
@@ -465,7 +465,7 @@ def judge_session(session: UserSession) -> Finding:
         step = "log in as this user (without su or sudo), or unset XDG_RUNTIME_DIR"
         return warning("session", f"{words}, which does not exist", step)
     if session.runtime_owner != session.uid:
-        step = f"run this as the user who owns it: sudo -u '#{session.runtime_owner}' talk doctor"
+        step = f"run talk doctor as the directory's owner: sudo -u '#{session.runtime_owner}' talk doctor"
         words = f"{words}, which belongs to uid {session.runtime_owner}, whose sound server accepts no other user"
         return warning("session", words, step)
     return ok("session", words)
@@ -495,7 +495,9 @@ def check_player(env: Mapping[str, str], configured: str | None, used: str | Non
     broken = warning if by_server else failure
     if used is None:
         package = next(iter(PACKAGES.values()))
-        return broken("player", f"none is on the PATH ({', '.join(PACKAGES)})", f"sudo apt-get install -y {package}")
+        return broken(
+            "player", f"no player is on the PATH ({', '.join(PACKAGES)})", f"sudo apt-get install -y {package}"
+        )
     if configured is None:
         how = " to play through the sound server" if used == "pulse" else ""
         return ok("player", f"{used} is used{how}" + (f"; other players: {', '.join(others)}" if others else ""))
@@ -536,7 +538,7 @@ def check_device(env: Mapping[str, str], player: str, configured: str | None) ->
     # A device such as plughw:1,0 may work even if ALSA doesn't list it. The sentence will show whether it does.
     if configured is None or configured in names or ":" in configured:
         return ok("device", f"{used}; {command} lists {join_names(names)}")
-    words = f"{configured} is not in the list of {command}: {join_names(names)}"
+    words = f"{configured} is not a device that {command} lists: {join_names(names)}"
     return warning("device", words, "restart the server with --device and one of these names")
 
 
@@ -545,12 +547,12 @@ def check_cards(cards: Sequence[str], server: SoundServer, session: UserSession)
     if cards:
         return ok("cards", join_names(cards))
     if server.name is not None:
-        return ok("cards", "this machine has none, but the sound server has an output")
+        return ok("cards", "this machine has no sound card, but the sound server has an output")
     if _CONTAINER in session.origins:
         step = "start the container with --device /dev/snd, or with the sound server's socket (see the README)"
-        return warning("cards", "this container has none", step)
+        return warning("cards", "this container has no sound card", step)
     has_sound = os.path.isdir(_KERNEL_SOUND)
-    words = "the kernel found none" if has_sound else f"the kernel has no sound support (no {_KERNEL_SOUND})"
+    words = "the kernel found no sound card" if has_sound else f"the kernel has no sound support (no {_KERNEL_SOUND})"
     return warning("cards", words, "connect a loudspeaker or a sound card, and check with: aplay -l")
 
 
@@ -599,7 +601,7 @@ def judge_sound_server(server: SoundServer, cards: Sequence[str], session: UserS
     at = f"{server.pulse_server} (PULSE_SERVER)" if server.pulse_server else join_names(server.sockets)
     if server.error is None:
         step = "sudo apt-get install -y pulseaudio-utils"
-        return warning(check, f"found one at {at}, but no program to check it (pactl or pw-cli)", step)
+        return warning(check, f"found a sound server at {at}, but no program to check it (pactl or pw-cli)", step)
     return _judge_unreachable(server, session, f"the sound server at {at} cannot be reached {where}: {server.error}")
 
 
@@ -616,7 +618,7 @@ def _judge_unreachable(server: SoundServer, session: UserSession, message: str) 
         step = "run the server as a service of your user: talk serve --print-unit user"
     elif session.sudo_uid is not None:
         hint = "; a sound server accepts only its own user, not root"
-        step = "run this without sudo, as the user of the sound server"
+        step = "run talk doctor without sudo, as the user of the sound server"
     elif session.runtime_dir is None and session.usual_runtime_dir is not None:
         step = f"export XDG_RUNTIME_DIR={session.usual_runtime_dir}"
     return warning(_SOUND_SERVER_CHECK, message + hint, step)

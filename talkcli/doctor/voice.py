@@ -245,7 +245,7 @@ def _check_voice_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
         more = f"; also faulty: {names}" if others else ""
         yield warning(_FILES_CHECK, f"{voice}: {message}{more}", step)
     elif valid:
-        yield ok(_FILES_CHECK, f"complete and safe: {join_names(valid)}")
+        yield ok(_FILES_CHECK, f"the files of {join_names(valid)} are complete and safe")
 
 
 def _find_package_fault(env: Mapping[str, str]) -> tuple[str, str] | None:
@@ -333,7 +333,7 @@ def judge_server_voices(voices: dict[str, Any]) -> list[Finding]:
     """
     for voice, each in voices.items():
         if each.get("state") == "failed":
-            step = f"check whether this is still true: talk set --voice {voice}"
+            step = f"try to load the voice again: talk set --voice {voice}"
             return [warning(_NEURAL_CHECK, f"the server cannot speak with the voice {voice}: {each.get('why')}", step)]
     return [ok(_NEURAL_CHECK, f"the server's neural voices: {join_names(list(voices))}")] if voices else []
 

@@ -140,7 +140,7 @@ def access_rules(
     if homeassistant:
         lines += [
             "",
-            "# Home Assistant may let each robot speak, cancel its sentences, and use all of its own topics.",
+            "# Home Assistant may make each robot speak, cancel sentences, and use all topics under homeassistant/.",
             f"user {HOMEASSISTANT}",
             f"topic write {robot('+', PLAIN_SAY, HOMEASSISTANT)}",
             f"topic write {robot('+', PLAIN_CANCEL, HOMEASSISTANT)}",
@@ -149,6 +149,6 @@ def access_rules(
             f"topic readwrite {HOMEASSISTANT}/#",
         ]
     if homeassistant and name is not None and "." in name:
-        words = "# This robot has another topic for Home Assistant, which allows no dot in a name."
+        words = "# Home Assistant does not allow dots in names, so this robot uses a different topic."
         lines += ["", words, f"user {name}", f"topic write {homeassistant_device(name)}"]
     return "\n".join(lines)

@@ -274,8 +274,8 @@ def _check_own_id(value: str) -> str | None:
     if is_clients_id(value):
         return None
     return (
-        f"the id {value[:MAX_ID_CHARS]!a} is not allowed: use 1 to {MAX_ID_CHARS} of A-Z a-z 0-9 . _ : / -, but not "
-        "only digits, no '-' at the beginning, and not the form of the server's own ids, such as 4k7f-12"
+        f"the id {value[:MAX_ID_CHARS]!a} is not allowed: use 1 to {MAX_ID_CHARS} characters from A-Z a-z 0-9 . _ : "
+        "/ -; an id can't be a number, begin with '-', or look like one of the server's own ids, such as 4k7f-12"
     )
 
 
@@ -307,7 +307,7 @@ OPTIONS = (
         "send the goal's states and its result to this connection",
         default=False,
         special_flags="-w, --wait",
-        help="Wait until the goal has ended. The exit code is the result.",
+        help="Wait until the goal has ended, and return its result as the exit code.",
     ),
     Option(
         "feedback",
@@ -320,20 +320,20 @@ OPTIONS = (
     Option(
         "patient",
         FLAG,
-        "if the queue is full, wait for room instead of rejecting the goal (`queue_full`); `ttl` includes this time",
+        "if the queue is full, wait for room (at most for the `ttl`) instead of rejecting the goal (`queue_full`)",
         default=False,
     ),
     Option(
         "preempt",
         FLAG,
-        "interrupt the current goal, unless its priority is higher, and go first",
+        "interrupt the current goal unless it has a higher priority, and go before waiting goals with equal priority",
         special_flags="--preempt/--queue",
         help="Interrupt the current sentence, or wait in the queue. [default: the server's setting]",
         setting=Setting(
             False,
-            meaning="whether goals without `preempt` interrupt the current goal",
-            set_help="Let new sentences interrupt the current one, or wait. 'talk say --queue' always waits.",
-            serve_help="Let new sentences interrupt the current one. 'talk say --queue' always waits.",
+            meaning="whether goals that were sent without `preempt` interrupt the current goal",
+            set_help="Choose whether new sentences interrupt the current sentence, or wait in the queue.",
+            serve_help="Let new sentences interrupt the current sentence, except with 'talk say --queue'.",
             flags="--preempt/--no-preempt",
             words="new goals interrupt",
             none_words="new goals wait",
@@ -349,26 +349,27 @@ OPTIONS = (
     Option(
         "priority",
         INTEGER,
-        "goals with a higher priority go first. Goals with the same priority are spoken in the order of their arrival",
+        "goals with a higher priority are spoken first, and goals with the same priority in the order of arrival",
         default=0,
         # The range is not in `limits`, because the help text would then show it.
         check=_check_priority,
         form=f"{-MAX_PRIORITY:,} to {MAX_PRIORITY:,}",
-        help="Go before sentences with a lower priority. Sentences with a higher one are never interrupted or removed.",
+        help="Set the priority. Sentences with a higher priority are spoken first, and this sentence never "
+        "interrupts them.",
         in_goal=True,
     ),
     Option(
         "ttl",
         SECONDS,
-        "seconds in which the goal must start, otherwise it is RECALLED; 0 for no limit",
+        "the goal is RECALLED if it has not started after this many seconds; 0 means no limit",
         limits=(0, None),
         help="Drop the sentence if it can't start within SEC seconds; 0 means no limit.",
         setting=Setting(
             0,
             none_value=0,
-            meaning="the `ttl` of goals that don't have one; 0 for no limit",
+            meaning="the `ttl` of goals that were sent without `ttl`; 0 means no limit",
             set_help=_EXPIRY_HELP,
-            serve_help=_EXPIRY_HELP + " 'talk say --ttl' sets another limit.",
+            serve_help=_EXPIRY_HELP + " 'talk say --ttl' overrides this limit.",
             words="ttl {} s",
             none_words="no ttl",
         ),
@@ -387,19 +388,20 @@ OPTIONS = (
     Option(
         "throttle",
         SECONDS,
-        "reject the goal if the same text is waiting, is being spoken, or started less than this many seconds ago. If "
-        "the goal has a key, only the current and earlier goals with the same key count",
+        "reject the goal if the same text is waiting, is being spoken, or started less than this many seconds ago. For "
+        "a goal with a key, keys are compared instead of texts, and waiting goals are ignored",
         limits=(0, None),
-        help="Skip the sentence if it was spoken in the last SEC seconds. With --key, only the keys are compared.",
+        help="Skip the sentence if the same text (with --key: any text with this key) was spoken in the last "
+        "SEC seconds.",
     ),
     Option(
         "id",
         WORD,
-        "an id that the sender chooses, see *Ids* below",
+        "an id chosen by the sender; see *Ids* below",
         check=_check_own_id,
-        form=f"1 to {MAX_ID_CHARS} characters of `A-Z a-z 0-9 . _ : / -`",
+        form=f"1 to {MAX_ID_CHARS} characters from `A-Z a-z 0-9 . _ : / -`",
         default_words="set by the server",
-        help="Choose the goal's id. A goal that is sent again with the same id is not spoken again.",
+        help="Choose the goal's id. If a goal with this id was already sent, the sentence is not spoken again.",
     ),
     Option(
         "rate",
@@ -434,7 +436,7 @@ OPTIONS = (
         setting=Setting(
             None,
             none_value=DEFAULT_VOICE,
-            set_help="Use this voice: an id, name or language from 'talk voices'. 'default' is the engine's own.",
+            set_help="Use this voice: an id, name or language from 'talk voices', or 'default' for the default voice.",
             words="voice {}",
             none_words="default voice",
         ),
@@ -446,7 +448,7 @@ OPTIONS = (
         "wait until the voice is loaded, and abort the goal (`voice_failed`) if the voice can't be used, instead of "
         "speaking with espeak",
         default=False,
-        help="Never use another voice. Wait until the voice is loaded, and fail if it can't be used.",
+        help="Wait until the voice is loaded, and fail instead of speaking with another voice.",
         for_engine=True,
     ),
     Option(
@@ -461,7 +463,7 @@ OPTIONS = (
     Option(
         "lead_in",
         INTEGER,
-        "milliseconds of silence before the sentence, even directly after another one; 0 for none",
+        "milliseconds of silence before the sentence, even if another sentence has just ended; 0 means none",
         limits=(0, MAX_LEAD_IN_MS),
         unit=" milliseconds",
         metavar="MS",
@@ -471,7 +473,7 @@ OPTIONS = (
     Option(
         "audible",
         FLAG,
-        "abort the goal (`muted`) if its output is muted. If this can't be known, the goal is spoken",
+        "abort the goal (`muted`) if the output is known to be muted",
         help="Fail if the output is muted. [default: the server's setting]",
         for_engine=True,
     ),
@@ -552,22 +554,24 @@ class Cancel:
 
     kind: ClassVar[str] = "cancel"
     meaning: ClassVar[str] = (
-        "Cancel the goals that match any of the fields, even `patient` goals that wait for room. Without "
-        "fields, cancel all goals"
+        "Cancel the goals that match any of the fields, including `patient` goals that are waiting for room. "
+        "Without fields, cancel all goals"
     )
     options: ClassVar[tuple[Option, ...]] = (
-        Option("ids", IDS, "these goals; an empty list selects no goal", form=f"of up to {MAX_IDS:,} ids"),
+        Option(
+            "ids", IDS, "the goals with these ids; an empty list selects no goals", form=f"of up to {MAX_IDS:,} ids"
+        ),
         Option(
             "current",
             FLAG,
             "the goal that is being spoken",
             default=False,
-            help="Cancel the current sentence. The next one follows.",
+            help="Cancel only the current sentence, and continue with the next one.",
         ),
         Option(
             "before",
             ID,
-            "this goal, and all goals that were accepted before it",
+            "the goal with this id, and all goals that were accepted before it",
             help="Cancel this goal and all goals accepted before it.",
             completion="goal_ids",
         ),
@@ -575,7 +579,7 @@ class Cancel:
             "key",
             WORD,
             "the current and the waiting goals with this key",
-            help="Cancel all sentences with this key, spoken or waiting.",
+            help="Cancel the current sentence and all waiting sentences that have this key.",
             completion="unfinished_keys",
         ),
     )

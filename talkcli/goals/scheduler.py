@@ -220,7 +220,9 @@ class Scheduler:
         self._by_id[record.id] = record
         effects: list[Effect] = [StateChange(record, State.PENDING)]
         if by:
-            words = "it was cancelled first" if canceled else "it was cancelled before it arrived"
+            words = (
+                "the goal was cancelled before it started" if canceled else "the goal was cancelled before it arrived"
+            )
             return record, effects + self._end_unqueued(record, Reason.CANCELED, words, by, now)
         if expired:
             words = _expiry_message(record)
@@ -249,7 +251,9 @@ class Scheduler:
             self._early_cancels.add(goal_id, by, now.monotonic)
         for record in chosen:
             if record.state is State.PENDING:
-                result.effects += self._recall(record, Reason.CANCELED, "it was cancelled first", by, now)
+                result.effects += self._recall(
+                    record, Reason.CANCELED, "the goal was cancelled before it started", by, now
+                )
                 result.recalled.append(record)
             else:
                 result.effects += self._stop(record, Reason.CANCELED, by, now)
@@ -466,7 +470,9 @@ class Scheduler:
             if record.stop_requested_at is None:
                 effects = self._stop(record, Reason.EXPIRED, None, now)
             else:
-                words = f"speech failed: it was stopped, but silence was not confirmed within {CONFIRM_SILENCE_S:g} s"
+                words = (
+                    f"speech failed: the goal was stopped, but silence was not confirmed within {CONFIRM_SILENCE_S:g} s"
+                )
                 effects = [EngineOrder(record, Order.GIVE_UP)]
                 effects += self._end(record, State.ABORTED, Reason.NOT_SILENT, words, record.by, now)
         return effects + self._expire(now) + self._start_next(now) + self._order_next_voice(now)

@@ -55,7 +55,7 @@ class Hello:
         Option(
             "urgent",
             FLAG,
-            "only `status` and `cancel` will follow; a full server keeps some places for such clients",
+            "the client only sends `status` and `cancel`; a full server still accepts a few such clients",
             default=False,
         ),
     )
@@ -115,7 +115,7 @@ class Log:
     """A request for the most recently ended goals, oldest first."""
 
     kind: ClassVar[str] = "log"
-    meaning: ClassVar[str] = "List the last goals that ended, including REJECTED ones, oldest first"
+    meaning: ClassVar[str] = "List the most recently ended goals, including REJECTED goals, oldest first"
     options: ClassVar[tuple[Option, ...]] = (
         Option("count", _COUNT_TYPE, "the maximum number of goals", 20, form=f"1 to {MAX_LOG_GOALS:,}"),
     )

@@ -202,12 +202,14 @@ def _path_of(passed: socket.socket) -> str:
         UsageError: if the socket is of another type, or has no path.
     """
     if passed.family != socket.AF_UNIX:
-        raise UsageError("the socket passed by systemd (LISTEN_FDS) is not a Unix socket; use ListenStream=/path")
+        raise UsageError("the socket from systemd (LISTEN_FDS) is not a Unix socket; use ListenStream=/path")
     if passed.type != socket.SOCK_STREAM or not passed.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
-        raise UsageError("the socket passed by systemd (LISTEN_FDS) doesn't listen; use ListenStream= and Accept=no")
+        raise UsageError(
+            "the socket from systemd (LISTEN_FDS) is not a listening socket; use ListenStream= and Accept=no"
+        )
     name = passed.getsockname()
     if not isinstance(name, str) or not os.path.isabs(name):
-        raise UsageError("the socket passed by systemd (LISTEN_FDS) has no path; use ListenStream=/path")
+        raise UsageError("the socket from systemd (LISTEN_FDS) has no path; use ListenStream=/path")
     return name
 
 
@@ -255,7 +257,9 @@ def _prepare_directory(directory: str) -> None:
     if not stat.S_ISDIR(status.st_mode):
         raise AddressInUse(f"{directory} is not a directory; choose another path for the socket")
     if status.st_uid not in {os.getuid(), 0}:
-        raise AddressInUse(f"the socket's directory {directory} belongs to uid {status.st_uid}; choose another one")
+        raise AddressInUse(
+            f"the socket's directory {directory} belongs to uid {status.st_uid}; choose another directory"
+        )
     if status.st_mode & 0o022 and not status.st_mode & stat.S_ISVTX:
         raise AddressInUse(
             f"other users can write to the socket's directory {directory} (mode {stat.S_IMODE(status.st_mode):04o}); "

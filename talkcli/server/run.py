@@ -233,7 +233,7 @@ class Server:
         pid, uid = peers.credentials(connection.stream.socket)
         # Other users may connect only if the socket's mode allows it.
         if uid not in {os.getuid(), 0} and not self._listener.mode & 0o066:
-            words = f"this server belongs to uid {os.getuid()}, who can let you in with: talk serve --socket-mode 0660"
+            words = f"this server belongs to uid {os.getuid()}; ask its owner to run: talk serve --socket-mode 0660"
             connection.close_with({"talk": PROTOCOL, "error": "permission_denied", "message": words})
         elif len(self.connections) >= self._settings.max_clients + MAX_EXTRA_CLIENTS:
             connection.close_with(busy_greeting())

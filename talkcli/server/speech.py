@@ -293,7 +293,11 @@ class Speech:
                 scheduler.output_changed(event.id, Output.from_json(event.output))
             case protocol.VoiceChosen():
                 if event.fallback_reason:
-                    log.write(log.sanitize(f"{event.id} is spoken by {event.voice} instead: {event.fallback_reason}"))
+                    log.write(
+                        log.sanitize(
+                            f"{event.id} is spoken with the voice {event.voice} instead: {event.fallback_reason}"
+                        )
+                    )
                 self.apply(scheduler.voice_chosen(event.id, event.voice, now))
             case protocol.Held():
                 if active.paused and active.pause_count == event.number:
@@ -427,7 +431,7 @@ def _log_voice_load(voice: protocol.VoiceLoaded) -> None:
     """Log that a neural voice was loaded, or that loading it failed."""
     how = f"loaded in {voice.seconds:.1f} s"
     if voice.error is not None:
-        how = f"can't be loaded, so espeak speaks (except with --voice-only): {log.sanitize(voice.error)}"
+        how = f"can't be loaded, so espeak is used instead (except with --voice-only): {log.sanitize(voice.error)}"
     log.write(f"voice {log.sanitize(voice.voice)} {how}")
 
 

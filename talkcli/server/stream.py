@@ -285,7 +285,7 @@ def raise_descriptor_limit(clients: int) -> int:
     if allowed < wanted:
         fitting = max(0, allowed - RESERVED_DESCRIPTORS - OWN_DESCRIPTORS)
         log.write(
-            f"only {allowed} files may be open, enough for {fitting} clients instead of {clients}; "
+            f"the limit of {allowed} open files only allows {fitting} clients instead of {clients}; "
             f"raise LimitNOFILE= or ulimit -n to {wanted}"
         )
     return allowed
@@ -354,7 +354,7 @@ class Acceptor:
 
     def _turn_away(self, connected: socket.socket) -> None:
         """Tell a client that the server has too few file descriptors, and close the connection."""
-        limit = f"only {self._max_descriptors} files may be open; raise LimitNOFILE= or ulimit -n"
+        limit = f"the limit of {self._max_descriptors} open files was reached; raise LimitNOFILE= or ulimit -n"
         log.write_limited("descriptors", f"refused a client: {limit}")
         with connected, contextlib.suppress(OSError):  # the client may have closed the connection
             connected.send(encode(busy_greeting(_TOO_FEW_DESCRIPTORS)))

@@ -100,7 +100,7 @@ def test_the_error_for_an_oversized_input_is_accurate(scripted: Talk) -> None:
 def test_invalid_utf8_bytes_are_skipped_and_reported(scripted: Talk) -> None:
     data = "length=0 Grüße:\n日本\n".encode() + "Grüße".encode("latin-1") + b" \xed\xa0\x80!"
     text = "length=0 Grüße:\n日本\nGr\ufffd\ufffde \ufffd\ufffd\ufffd!"
-    note = "talk: line 3, column 3: the byte 0xfc is not valid UTF-8, so it is not spoken (4 more like it)\n"
+    note = "talk: line 3, column 3: the byte 0xfc is not valid UTF-8 and is skipped (4 more like it)\n"
     for options, expected in ((["--json"], note), (["--json", "-q"], "")):
         for args, stdin in (([b"--", data], b""), ([b"-"], data)):
             command: list[str | bytes] = [*TALK, *options, "say", "--wait", *args]

@@ -203,4 +203,4 @@ def test_a_users_server_admits_root_and_refuses_other_users(home: str) -> None:
         os.chmod(path, 0o666)
         (reply,) = replies(stranger(path, {"request": "status"}))
         assert reply["error"] == "permission_denied"
-        assert "uid 4141, who can let you in" in reply["message"]
+        assert "uid 4141; ask its owner to run" in reply["message"]

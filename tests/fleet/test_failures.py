@@ -199,13 +199,13 @@ def test_a_malformed_request_gets_the_protocols_error(shared_robot: Robot) -> No
 
 def test_a_robot_accepts_only_allowed_requests(make_robot: MakeRobot) -> None:
     anna = make_robot("anna")
-    assert_refused(anna.desk("set", "--rate", "300"), 10, "anna: remote clients may not use set on this robot")
+    assert_refused(anna.desk("set", "--rate", "300"), 10, "anna: this robot's bridge does not allow set requests")
     bert = make_robot("bert", "--allow", "say,set")
     assert bert.bridge.await_online()["allow"] == ["say", "set"]
     assert bert.desk("set", "--rate", "300").code == 0
     assert bert.talk.request("set")["settings"]["rate"] == 300
     for request in ("cancel", "status"):
-        assert_refused(bert.desk(request), 10, f"bert: remote clients may not use {request} on this robot")
+        assert_refused(bert.desk(request), 10, f"bert: this robot's bridge does not allow {request} requests")
     assert bert.desk("say", "hello").code == 0
 
 

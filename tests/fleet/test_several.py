@@ -150,7 +150,7 @@ def test_the_text_is_read_as_for_one_robot(pair: RealRobots, desk: Desk) -> None
     assert {goal["text"] for goal in pair.each(lambda robot: robot.talk.goal("from-input"))} == {text.rstrip()}
     done = desk.run("say", "--wait", "--id", "bytes", "caf\udce9 au lait")
     assert_outcomes(done, 0, alike(PAIR, "bytes", "SUCCEEDED", 0), "2 of 2 robots succeeded")
-    assert done.err.splitlines()[0] == "talk: line 1, column 4: the byte 0xe9 is not valid UTF-8, so it is not spoken"
+    assert done.err.splitlines()[0] == "talk: line 1, column 4: the byte 0xe9 is not valid UTF-8 and is skipped"
     assert {goal["text"] for goal in pair.each(lambda robot: robot.talk.goal("bytes"))} == {"caf\ufffd au lait"}
     for done in (desk.run("say", "  "), desk.run("say", "-", stdin="\n")):
         assert {(state, code) for _, state, code in printed_outcomes(done).values()} == {("REJECTED", 5)}

@@ -97,13 +97,13 @@ WHY = [
         "wh-[3]",
         "wh-3",
         "permission_denied",
-        "wh-3: remote clients may not use pause on this robot; add it to --allow of its bridge",
+        "wh-3: this robot's bridge does not allow pause requests; add pause to its --allow",
     ),
     (
         "@day",
         "wh-3",
         "permission_denied",
-        "wh-3: remote clients may not use pause on this robot; add it to --allow of its bridge",
+        "wh-3: this robot's bridge does not allow pause requests; add pause to its --allow",
     ),
 ]
 

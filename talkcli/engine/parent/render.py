@@ -121,7 +121,7 @@ def render(
             raise TimeoutError("the text was not rendered in time") from None
         except CannotWrite as error:
             if output_fd is not None and path in STANDARD_OUTPUT and wait_ready({output_fd: 0}, 0.0):
-                raise BrokenPipeError(errno.EPIPE, "the reader of standard output has closed it") from error
+                raise BrokenPipeError(errno.EPIPE, "the program that reads standard output has closed it") from error
             raise
 
 

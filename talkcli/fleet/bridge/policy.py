@@ -163,7 +163,7 @@ class Policy:
                 raise BadRequest(f"correlation data must have at most {MAX_CORRELATION_BYTES} bytes", "bad_field")
             request = read_request(fields)
             if request.kind not in self._allow:
-                words = f"remote clients may not use {request.kind} on this robot; add it to --allow of its bridge"
+                words = f"this robot's bridge does not allow {request.kind} requests; add {request.kind} to its --allow"
                 raise BadRequest(words, "not_allowed")
             if isinstance(request, Say) and now - self.newest_echo_at > STALE_AFTER_S:
                 words = "the connection to the broker stalled; send the sentence again if it is still true"

@@ -145,7 +145,7 @@ class RemoteSessions:
         candidates = [each for each in sessions if each.idle] or (sessions if urgent else [])
         if candidates:
             oldest = min(candidates, key=lambda each: each.used_at)
-            oldest.end("the session was closed to make room for an urgent request of another client")
+            oldest.end("the session was closed to make room for an urgent request from another client")
         return bool(candidates)
 
     # -- from the sessions
@@ -162,7 +162,7 @@ class RemoteSessions:
         """Cancel the goals waiting in the bridge that match a `cancel` request, and return them."""
         selected = [self.waiting[each] for each in selection.select_waiting([say for _, say, _ in self.waiting])]
         self.waiting = [each for each in self.waiting if not any(each is other for other in selected)]
-        ending = State.RECALLED, "canceled", "not spoken: it was cancelled first", canceled_by
+        ending = State.RECALLED, "canceled", "not spoken: the goal was cancelled before it started", canceled_by
         return [session.end_goal(request, say, *ending) for request, say, session in selected]
 
     def handle_pending_change(self) -> None:
