@@ -31,7 +31,7 @@ _COMPILE_AFTER_COUNT = 100
 
 @dataclass_transform(frozen_default=True)
 def frozen(cls: type[_T]) -> type[_T]:
-    """Turn a class into an immutable value class, which is compared, hashed and printed by its fields."""
+    """Turn a class into an immutable value class."""
     # Annotations are strings, because every module has `from __future__ import annotations`.
     names = tuple(name for name, kind in cls.__annotations__.items() if not kind.startswith("ClassVar"))
     own = {name: each for name, each in cls.__dict__.items() if name not in {*names, "__dict__", "__weakref__"}}

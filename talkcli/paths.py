@@ -56,7 +56,7 @@ def client_sockets(named: str | None) -> list[str]:
 
 
 def describe_place(path: str, error: OSError) -> str:
-    """Return why connecting to this path failed, as one of the PLACE texts or the system's error message."""
+    """Return the reason why connecting to a socket path failed."""
     try:
         mode = os.stat(path).st_mode
     except OSError:  # `error` gives the reason, unless the file has just been removed
@@ -88,13 +88,13 @@ def _runtime_directories(uid: int) -> list[str]:
 
 
 def sudo_caller(environment: Mapping[str, str]) -> int | None:
-    """Return the user id of the user who called sudo, or None if this process isn't root under sudo."""
+    """Return the id of the user who ran sudo, or None outside sudo."""
     caller = environment.get("SUDO_UID", "")
     return int(caller) if os.getuid() == 0 and caller.isdecimal() else None
 
 
 def sudo_caller_socket() -> str | None:
-    """Return the socket path of the user who called sudo, or None if they have no socket or didn't call sudo."""
+    """Return the socket path of the user who ran sudo, if there is one."""
     caller = sudo_caller(os.environ)
     if caller is None:
         return None
@@ -163,10 +163,10 @@ def cache_directory() -> str:
     """Return the path of the cache directory, which may not exist yet."""
     given = os.environ.get("CACHE_DIRECTORY")
     if given:
-        return os.path.realpath(given.split(":")[0])  # a symbolic link, if the unit has DynamicUser=
+        return os.path.realpath(given.split(":")[0])  # this is a symbolic link if the unit sets DynamicUser=
     return os.path.join(_user_directory(os.environ.get("XDG_CACHE_HOME"), "~/.cache"), "talk")
 
 
 def _user_directory(named: str | None, default: str) -> str:
-    """Return the given directory if it is an absolute path, or else the default with `~` expanded."""
+    """Return a directory if its path is absolute, or else the default."""
     return named if named and os.path.isabs(named) else os.path.expanduser(default)

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 
-#: A time that never comes, for a wait without a time limit.
+#: The deadline of a wait without a time limit.
 NEVER = float("inf")
 
 
@@ -22,7 +22,7 @@ class Interrupted(Exception):
 def wait_ready(
     watched: Mapping[int, int], timeout: float | None, interrupt: Mapping[int, int] | None = None
 ) -> set[int]:
-    """Wait for descriptors, and return the ready ones, if any.
+    """Wait until descriptors are ready, and return them.
 
     Raise Interrupted if one of `interrupt` is ready.
 

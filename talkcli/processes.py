@@ -1,4 +1,4 @@
-"""Pipes that show whether processes are still running, and functions to kill those processes."""
+"""Functions that find and kill running processes with the help of pipes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _RELEASE_S = 0.01
 
 
 def open_pipes(count: int) -> list[tuple[int, int]]:
-    """Open pipes, and return the reading and writing end of each.
+    """Open pipes, and return both ends of each.
 
     If one can't be opened, none is left open.
     """
@@ -39,7 +39,7 @@ def close(*descriptors: int) -> None:
 
 
 def is_held(pipe: int, seconds: float = 0.0) -> bool:
-    """Wait up to `seconds` for the other end of the pipe to close, and return whether it is still open."""
+    """Return whether the other end of a pipe stays open for this time."""
     # Don't use `wait_ready` here. A player may be killed while the interpreter exits, when modules can't be imported.
     poll = select.poll()
     poll.register(pipe, 0)  # Linux reports that the other end was closed even if no events are requested
@@ -47,9 +47,9 @@ def is_held(pipe: int, seconds: float = 0.0) -> bool:
 
 
 def kill_holders(pipe: int) -> bool:
-    """Kill all other processes that hold the pipe open, and return whether any was killed.
+    """Kill all other processes that hold a pipe open.
 
-    Another user's process can't be killed, and without /proc no process can be found.
+    Return whether any was killed. Another user's process can't be killed, and without /proc no process can be found.
     """
     if not is_held(pipe, _RELEASE_S):
         return False

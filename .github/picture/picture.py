@@ -1,4 +1,4 @@
-"""Creates the README's animated picture from a real terminal session and a real server that plays no sound.
+"""Creates the README's animated picture by recording a terminal session.
 
     python .github/picture/picture.py [FILE]      the default is talk.svg beside this script
 
@@ -97,7 +97,7 @@ class Screen:
         return "".join(character for character, _ in self.rows[-1])
 
     def frame(self, at: float) -> Frame:
-        """Return a copy of the screen for this time."""
+        """Return the current screen as a frame."""
         return Frame(at, tuple(map(tuple, self.rows)))
 
     def _control(self, numbers: str, letter: str) -> None:
@@ -110,7 +110,7 @@ class Screen:
 
 
 def record(speed: float) -> list[Frame]:
-    """Type and run the commands in a terminal, and return all screens.
+    """Run commands in a terminal, and record the screen.
 
     At speed 0, there are no pauses.
     """
@@ -127,7 +127,7 @@ def record(speed: float) -> list[Frame]:
 
 
 def _environment(place: str) -> dict[str, str]:
-    """Create a `talk` command in the directory `place`, and return an environment that uses it."""
+    """Create a `talk` command in `place`, and return an environment for it."""
     talk = Path(place, "talk")
     talk.write_text(f'#!/bin/sh\nexec {sys.executable} -m talkcli "$@"\n', encoding="utf-8")
     talk.chmod(0o755)
@@ -143,7 +143,7 @@ def _environment(place: str) -> dict[str, str]:
 
 
 def _serve(stack: contextlib.ExitStack, env: dict[str, str]) -> None:
-    """Start a server, and wait until its engine is ready. The stack ends it."""
+    """Start a server, and wait until its engine is ready."""
     server = subprocess.Popen(
         [sys.executable, "-m", "talkcli", "serve", "--player", "null", "--rate", "120"],
         env=env,
@@ -178,7 +178,7 @@ class _Typist:
         self._began = time.monotonic()
 
     def press(self, keys: str) -> None:
-        """Type these keys."""
+        """Type the given keys."""
         os.write(self._terminal, keys.encode())
 
     def watch(self, seconds: float) -> None:
@@ -188,7 +188,7 @@ class _Typist:
             self._draw(left)
 
     def watch_until(self, seen: Callable[[str], bool]) -> None:
-        """Record the screen until `seen` returns true for its last row."""
+        """Record the screen until its last row meets a condition."""
         end = time.monotonic() + COMMAND_LIMIT_S
         while not seen(self._screen.last()):
             self._draw(end - time.monotonic())
@@ -203,7 +203,7 @@ class _Typist:
 
 
 def _type(terminal: int, speed: float) -> list[Frame]:
-    """Type all commands one after another, and return all screens."""
+    """Type all commands one after another, and record the screen."""
     typist = _Typist(terminal)
     for command in COMMANDS:
         typist.watch_until(PROMPT.__eq__)
@@ -249,7 +249,7 @@ def picture(frames: list[Frame]) -> str:
 
 
 def _lives(frames: list[Frame], number: int, whole: float) -> list[tuple[Row, float, float]]:
-    """Return the contents of a row, each with the times at which it appears and disappears.
+    """Return when each content of a row appears and disappears.
 
     Omit empty contents.
     """

@@ -61,7 +61,7 @@ class _OptionType(click.FloatRange):
         super().__init__(*option.limits, min_open=option.excludes_minimum)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Parse the value of an option, or raise BadParameter with the name of the option or variable."""
+        """Parse the value of an option, or raise BadParameter."""
         try:
             return read_value(self._option, str(value))
         except ValueError as error:
@@ -120,7 +120,7 @@ def _make_click_argument(argument: Option) -> click.Argument:
 
 
 def _make_completer(name: str) -> Callable[..., list[CompletionItem]] | None:
-    """Create the function that click calls to complete a value, or return None if the name is empty."""
+    """Create the function with which click completes a value."""
 
     def complete(context: click.Context, _: click.Parameter, incomplete: str) -> list[CompletionItem]:
         from talkcli.cli import completion
@@ -131,7 +131,7 @@ def _make_completer(name: str) -> Callable[..., list[CompletionItem]] | None:
 
 
 def _store_common(context: click.Context, parameter: click.Parameter, value: object) -> None:
-    """Store the value of a common option in the CommonOptions object, unless the value is empty."""
+    """Store the value of a common option in the CommonOptions object."""
     if value:
         setattr(context.ensure_object(CommonOptions), parameter.name or "", value)
 
@@ -196,7 +196,7 @@ class ClickCommand(_HelpfulCommand):
         self.write_options("Options", (each for each in self.params if each.expose_value), ctx, formatter)
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the table of exit codes, if there is one, and a reference to `talk --help`."""
+        """Write the table of exit codes and a reference to `talk --help`."""
         super().format_epilog(ctx, formatter)
         formatter.write("\nCommon options and exit codes: talk --help\n")
 
@@ -215,7 +215,7 @@ class ClickCommand(_HelpfulCommand):
         return self.row.run(options, given)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the arguments, and raise a click.UsageError for extra arguments, except during completion."""
+        """Parse the arguments, and raise a click.UsageError if there are too many."""
         ctx.allow_extra_args = True  # extra arguments are reported below
         try:
             rest = super().parse_args(ctx, args)
@@ -229,7 +229,7 @@ class ClickCommand(_HelpfulCommand):
 
 
 class _CommandGroup(_HelpfulCommand, click.Group):
-    """The group of all commands, which are created when they are first needed."""
+    """The group of all commands, each created when it is first used."""
 
     examples, exit_codes = _EXAMPLES, ALL_EXIT_CODES
 
@@ -270,7 +270,7 @@ class _CommandGroup(_HelpfulCommand, click.Group):
 @click.version_option(__version__, prog_name="talk", message="%(prog)s %(version)s")
 @click.pass_context
 def talk(context: click.Context) -> None:
-    """Print an overview if no command is given. Click calls this before it runs a command."""
+    """Print an overview if no command is given."""
     if context.invoked_subcommand is None:
         click.echo(_first_screen(context))
 
@@ -326,7 +326,7 @@ def _run_group(arguments: list[str], options: CommonOptions) -> object:
 
 
 def _write_lines(text: str, formatter: click.HelpFormatter) -> None:
-    """Write each line of a text at the formatter's current indentation, without wrapping it."""
+    """Write the lines of a text, indented but not wrapped."""
     for line in text.strip().splitlines():
         formatter.write(f"{'':{formatter.current_indent}}{line.strip()}\n")
 

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from talkcli.cli.show import CommonOptions
 
     ExitCodes = Mapping[int | str, str]
-    #: A function that returns an error message if the given options can't be combined. Its arguments are the values of
-    #: all options, by name, and the names of the options that were given on the command line.
+    #: A function that returns an error message if options can't be combined. It receives the values of all options by
+    #: name, and the names of the options that were given.
     Rule = Callable[[Mapping[str, Any], frozenset[str]], str | None]
 
 #: The path of an output file.
@@ -63,11 +63,11 @@ class Command:
     description: str
     #: example command lines, one per line
     examples: str
-    #: the function that runs the command, as "module:name", or an empty string for the function in `ask` with the
-    #: command's name; the arguments of the function are the common options and the command's own
+    #: the function that runs the command, as "module:name". If empty, the function in `ask` with the command's name is
+    #: used. Its arguments are the common options and the command's own.
     function: str = ""
     options: tuple[Option, ...] = ()
-    #: the positional argument; it accepts any number of words if its metavar ends with "..."
+    #: the positional argument, which takes any number of words if its metavar ends with "..."
     argument: Option | None = None
     #: whether the command may connect even if the server has reached its client limit
     urgent: bool = False
@@ -80,11 +80,11 @@ class Command:
     #: the function that sends the command to several robots, as "module:name", or an empty string
     fleet_function: str = ""
     rule: Rule | None = None
-    #: the meanings of the exit codes that help shows, or None if it shows none
+    #: the exit codes to show in the help, with their meanings
     exit_codes: ExitCodes | None = None
 
     def usage_fault(self, given: Mapping[str, Any], typed: frozenset[str], common: Mapping[str, Any]) -> str | None:
-        """Return an error message if an option is invalid or options can't be combined, otherwise None.
+        """Return an error message if options are invalid or can't be combined.
 
         Args:
             given: the values of the command's own options and of its argument, by name.
@@ -113,7 +113,7 @@ class Command:
         return not self.uses_server or given.get("output") is not None
 
     def _robot_fault(self, robot: str, given: Mapping[str, Any], connect_timeout: float | None) -> str | None:
-        """Return an error message if the command can't be sent to this robot or these robots, otherwise None."""
+        """Return an error message if the command can't be sent to the selected robots."""
         from talkcli.fleet.desk.request import Selection, selects_several
 
         if selects_several(robot):
@@ -126,7 +126,7 @@ class Command:
         return Selection(robot).fault
 
     def run(self, options: CommonOptions, given: Mapping[str, Any]) -> int | None:
-        """Run the command on this machine, one robot or several robots.
+        """Run the command on this machine or on robots.
 
         Return its exit code, or None for success.
         """
@@ -189,13 +189,13 @@ COMMON_OPTIONS = (
 
 
 def long_flag(option: Option, value: object = None) -> str:
-    """Return the long flag of an option, such as --preempt, or the negative one if `value` is False."""
+    """Return the long flag that sets an option to a value, such as --preempt."""
     forms = option.flags.split("/")
     return (forms[-1] if value is False else forms[0]).split(", ")[-1]
 
 
 def read_value(option: Option, text: str) -> Any:
-    """Parse and check the text of an option's value, and return the value.
+    """Parse and check the value of an option.
 
     Raises:
         ValueError: the text isn't a valid value. The message says why.
@@ -289,7 +289,7 @@ def replace_bad_bytes(text: str, first_line: int = 1) -> tuple[str, str | None]:
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
-    """Return the known word that is most similar to this one, or None if there is no close match."""
+    """Return the closest match among the known words, if there is one."""
     import difflib
 
     by_name = {each.lower(): each for each in known}

@@ -27,7 +27,7 @@ def _timeout_option(help_text: str) -> Option:
 
 
 def _print_unit_option(*names: str) -> Option:
-    """Return a --print-unit option that accepts these names of units."""
+    """Return a --print-unit option with a choice of units."""
     words = f"Print a systemd unit with the given options, and exit. UNIT is one of {', '.join(names)}."
     return option("--print-unit", TEXT, words, metavar="UNIT", choices=names)
 
@@ -59,7 +59,7 @@ _OTHER_EXTENSIONS = (".aac", ".aiff", ".au", ".flac", ".m4a", ".mp3", ".mp4", ".
 
 
 def _say_fault(given: Mapping[str, Any], typed: frozenset[str]) -> str | None:
-    """Return an error message if these options of `say` can't be combined, otherwise None."""
+    """Return an error message if options of `say` can't be combined."""
     output, text, waits = given["output"], given["text"], given["wait"] or given["feedback"]
     if output is not None:
         named = [long_flag(each, given[each.name]) for each in _SAY_OPTIONS if each.name in typed - _SERVERLESS_OPTIONS]
@@ -140,7 +140,7 @@ _SERVE_OPTIONS = (
 
 
 def _serve_fault(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
-    """Return an error message if these options of `serve` can't be combined, otherwise None."""
+    """Return an error message if options of `serve` can't be combined."""
     player = given["player"] or ""
     if given["device"] and player.startswith(("null", "file:")):
         return f"the player {player} has no devices; leave out --device"
@@ -150,7 +150,7 @@ def _serve_fault(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
 
 
 def _bridge_fault(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
-    """Return an error message if `bridge` needs a --name and none is given, otherwise None."""
+    """Return an error message if `bridge` lacks a required --name."""
     if given["name"] is None and not given["print_acl"]:
         return "--name is missing; choose the robot's name on the broker, as in: talk bridge --name anna"
     return None

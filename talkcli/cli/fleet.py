@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def fleet(options: CommonOptions, what: str, long: bool) -> int | None:
-    """Show the state of each selected robot or, if `what` is "watch", show events until interrupted.
+    """Show the robots of a fleet, or watch their events.
 
     Return the exit code, or None for success.
     """
@@ -56,7 +56,7 @@ def _no_robot_error(broker: Broker, selection: Selection | None) -> ServerUnavai
 
 
 def _watch(options: CommonOptions, broker: Broker, selection: Selection | None, *, long: bool) -> int:
-    """Show the events of the selected robots until the command is interrupted, and return the exit code."""
+    """Show the events of the selected robots until interrupted."""
     from talkcli.cli.interrupts import Interrupts, has_reader
     from talkcli.fleet.desk.watch import FleetWatch
 
@@ -103,5 +103,5 @@ def _show_event(
 
 
 def _snapshot_object(robot: RobotInfo) -> JsonObject:
-    """Return the JSON object that `talk fleet watch` prints for the whole state of a robot."""
+    """Return the JSON object for a robot's whole state."""
     return {"robot": robot.presence.name, "event": "snapshot", **robot.to_json()}

@@ -69,7 +69,7 @@ class Interrupts:
 
     @property
     def exit_code(self) -> int:
-        """The command's exit code after a signal or closed output has ended the wait."""
+        """The command's exit code after an interrupted wait."""
         return EXIT_SIGPIPE if self.signal_number is None else EXIT_SIGNAL + self.signal_number
 
     def __enter__(self) -> Interrupts:

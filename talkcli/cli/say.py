@@ -103,7 +103,7 @@ def _read_input(
 
 
 def replace_and_report_bad_bytes(text: str, options: CommonOptions) -> str:
-    """Replace invalid UTF-8 in a text, and return it.
+    """Replace invalid UTF-8 in a text.
 
     Print a message about the change unless --quiet is given.
     """
@@ -181,7 +181,7 @@ def _write_file(
 
 
 def _sound_settings(goal_options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the engine's settings, by name, from the options or else from environment variables."""
+    """Return the engine's settings from options and environment variables."""
     found = {}
     for option in SOUND_OPTIONS:
         value, text = goal_options[option.name], os.environ.get(option.env) if option.env else None

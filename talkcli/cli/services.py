@@ -47,7 +47,7 @@ _HOME_DIRECTORIES = ("/home/", "/root/", "/run/user/")
 
 
 def serve(options: CommonOptions, print_unit: str | None, **given: Any) -> int:
-    """Run the server or print a systemd unit for it, and return the exit code.
+    """Run the server, or print a systemd unit for it.
 
     `given` contains all other options, by name.
     """
@@ -72,7 +72,7 @@ def _warn_about_sound(player: str, driver: str | None) -> None:
     from talkcli.engine.voices import is_own_driver
 
     if is_silent(player) or not is_own_driver(driver):
-        return  # other drivers play sound themselves, and the server reports this
+        return  # the server reports sound problems of other drivers
     if (not player or player in PACKAGES) and has_no_output(os.environ):
         note(_NO_DEVICE)
     if not player or (player in PLAYERS and player not in PACKAGES):
@@ -110,7 +110,7 @@ def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **gi
     if print_unit:
         words = ["--insecure"] if options.insecure else []
         return _print_unit(options, "bridge", print_unit, given, words, environment=_BRIDGE_ENVIRONMENTS[print_unit])
-    options.broker()  # check the settings, and whether the package for the next import is installed
+    options.broker()  # check the settings and the package that the next import needs
     from talkcli.fleet.bridge.main import BridgeSettings, run_bridge
 
     settings = BridgeSettings(
@@ -190,7 +190,7 @@ def _format_option(option: Option, value: object) -> str:
 
 
 def _find_inaccessible(files: Sequence[str]) -> tuple[str, str] | None:
-    """Return a file that other users can't reach and the directory that blocks them, or None if there is none."""
+    """Find a file that other users can't reach, and the directory that blocks them."""
     for path in files:
         steps = path.split(os.sep)
         for count in range(2, len(steps)):
@@ -215,7 +215,7 @@ def _escape_match(found: re.Match[str]) -> str:
 
 
 def _escape_path(path: str) -> str:
-    """Escape a path for a setting in a unit, or raise UsageError if systemd would misread the path."""
+    """Escape a path for a setting in a systemd unit."""
     if re.search(_UNSAFE_CHARACTERS, path) or path.endswith(("\\", " ")):
         raise UsageError(
             f"a socket unit can't contain the path {printable(path)}; choose one without control characters"

@@ -42,7 +42,7 @@ _NO_BREAK_SPACE = "\0"
 
 
 class CommonOptions:
-    """The options common to all commands, and the connection to the server if it is already open."""
+    """The options common to all commands."""
 
     socket: str | None = None
     robot: str | None = None
@@ -50,7 +50,7 @@ class CommonOptions:
     json = False
     quiet = False
     connect_timeout: float | None = None
-    #: the connection that `plain` has opened, or None; the request may already have been sent
+    #: the connection, if `plain` has opened one. The request may already have been sent.
     early: ConnectionAttempt | None = None
     #: signals that stay blocked until the command can handle them
     blocked_signals: Iterable[int] = ()
@@ -65,7 +65,7 @@ class CommonOptions:
         vars(self).update(given)
 
     def deadline(self, timeout: float | None) -> float | None:
-        """Convert a timeout, counted from the start of the command, to a monotonic time.
+        """Convert a timeout to a deadline, counted from the start of the command.
 
         None means no limit.
         """
@@ -117,7 +117,7 @@ class CommonOptions:
         return from_environment(os.environ, insecure=self.insecure)
 
     def _open_connection(self, **options: Any) -> Connection:
-        """Connect to the selected robot, or to the server on this machine if no robot is selected."""
+        """Connect to the selected robot, or to the server on this machine."""
         robot = paths.named_robot(self.robot, self.socket)
         if not robot:
             from talkcli.client.connection import SocketConnection
@@ -130,7 +130,7 @@ class CommonOptions:
 
 
 def run_command(command: Callable[[], object], options: CommonOptions) -> int:
-    """Run a command, report its errors on standard error, and return its exit code.
+    """Run a command, report its errors, and return its exit code.
 
     If the command returns a number, that is its exit code. Any other value means success.
     """
@@ -342,7 +342,7 @@ def terminal_columns(stream: TextIO) -> int:
 
 
 def _wrap(text: str) -> str:
-    """Wrap a message to the width of the terminal at standard error, without breaking commands in it."""
+    """Wrap a message to the width of the terminal, without breaking commands."""
     columns = terminal_columns(sys.stderr)
     if all(len(line) <= columns for line in text.split("\n")):
         return text
@@ -400,7 +400,7 @@ def has_colour() -> bool:
 
 
 def screen(*, long: bool = False, boot: str = "") -> Screen:
-    """Return a Screen, which describes the width and colours of standard output and how much detail to show."""
+    """Return the properties of standard output as a Screen."""
     from talkcli.terminal.text import Screen
 
     if sys.stdout is None or not sys.stdout.isatty():

@@ -58,7 +58,7 @@ class InputTooLong(UsageError):
 
 
 def read_text(end: float | None, *, stop_without_reader: bool = False, any_length: bool = False) -> str | int:
-    """Return all of standard input as one text, or an exit code if a signal or closed output ended the reading.
+    """Return all of standard input as one text, or an exit code if interrupted.
 
     Args:
         end: the monotonic time by which the input must have ended, or None for no limit.
@@ -136,7 +136,7 @@ class LineBuffer:
 
     @property
     def first(self) -> InputLine | None:
-        """The oldest line that isn't blank, or None if the buffer contains no such line."""
+        """The oldest line that isn't blank."""
         while not self._lines and self._chunks:
             now, data = self._chunks.popleft()
             self.size -= len(data)
@@ -177,13 +177,13 @@ def _read_available() -> bytes | None:
 
 
 def _decode_text(data: bytes) -> str:
-    """Decode UTF-8, with surrogates for invalid bytes, and remove line breaks at the end."""
+    """Decode UTF-8, and remove line breaks at the end."""
     # Invalid bytes are decoded to surrogates, which `replace_bad_bytes` replaces later.
     return data.decode(errors="surrogateescape").rstrip("\r\n")
 
 
 class LineSpeaker:
-    """Speaks the lines of standard input for `say --lines`, each line as a goal."""
+    """Speaks each line of standard input as a goal, for `say --lines`."""
 
     def __init__(
         self,
@@ -221,8 +221,7 @@ class LineSpeaker:
         self._sending: int | None = None
         #: the goal and its unanswered request, or None
         self._unanswered: tuple[GoalHandle, Exchange] | None = None
-        #: unfinished goals with their line numbers, in the order of the lines; with --wait, also ended goals that
-        #: haven't been reported yet
+        #: goals that haven't ended (or, with --wait, haven't been reported), with their line numbers
         self._goals: deque[tuple[int, GoalHandle]] = deque()
         #: whether the user has been told that speech is paused
         self._pause_known = False
@@ -232,7 +231,7 @@ class LineSpeaker:
         self._failure: tuple[int, int] | None = None
 
     def run(self) -> int:
-        """Connect, send all lines and, with --wait, wait until their goals have ended.
+        """Connect, send all lines, and wait for the goals if requested.
 
         Return the exit code.
         """
@@ -291,7 +290,7 @@ class LineSpeaker:
 
     @property
     def _has_lines(self) -> bool:
-        """Whether there are more lines to send or more input to expect."""
+        """Whether more lines may have to be sent."""
         return self._buffer.first is not None or not self._buffer.ended
 
     @property
@@ -315,7 +314,7 @@ class LineSpeaker:
         return not (self._buffer.first or self._unanswered or self._full)
 
     def _step(self) -> None:
-        """Drop expired lines, send as many lines as possible, and process the next input, answer or event.
+        """Send as many lines as possible, and process the next input or message.
 
         Raises:
             TimeoutError: the time limit of the command is over.
@@ -364,7 +363,7 @@ class LineSpeaker:
         self._unanswered = handle, self._connection.begin(request, accepted)
 
     def _process_answer(self) -> None:
-        """If the server has answered the last line, report whether its goal was accepted.
+        """Process the server's answer to the last line, if it has arrived.
 
         Follow an accepted goal.
         """
@@ -379,14 +378,14 @@ class LineSpeaker:
         self._sending = None
         self._call_writer(self._reporter.show_accepted, handle, self._pause_known)
         self._pause_known = handle.speech_paused
-        if not self._wait:  # report the state in the reply, because the goal may have ended since then
+        if not self._wait:  # report the state from the reply, because the goal may have ended in the meantime
             self._call_writer(self._reporter.report, Goal.from_json(reply.get("goal")))
         elif not self._goals:
             self._feedback.begin([handle.goal])
         self._goals.append((number, handle))
 
     def _report_rejected(self, number: int, goal: Goal) -> None:
-        """Report a rejected line, and record its exit code as a failure."""
+        """Report a rejected line, and record the failure."""
         self._sending = None
         self._record_failure(number, self._call_writer(self._reporter.report_refused, goal, f"line {number}: "))
 
@@ -402,7 +401,7 @@ class LineSpeaker:
             self._record_failure(line.number, code)
 
     def _record_failure(self, number: int, code: int) -> None:
-        """Record an exit code, unless it is 0 or an earlier line has failed."""
+        """Record a line's exit code if it is the first failure."""
         if code and (self._failure is None or number < self._failure[0]):
             self._failure = number, code
 
@@ -416,7 +415,7 @@ class LineSpeaker:
     # Waiting for input and for the server
 
     def _wait_for_news(self) -> None:
-        """Wait for input, an answer or an event until the next deadline, and add any input to the buffer."""
+        """Wait for input or a message from the server, until the next deadline."""
         watched = self._interrupts.watched
         first = self._buffer.first
         end = min(first.end, self._end) if first and self._error is None else self._end
@@ -474,7 +473,7 @@ class LineSpeaker:
     # Stopping before the end of the input
 
     def _stop_early(self) -> None:
-        """With --wait, cancel all goals. Then report the first line that wasn't sent."""
+        """Cancel the goals with --wait, and report the first unsent line."""
         if self._wait:
             # Close the connection first. Otherwise, a line that is waiting for room in the queue would be accepted when
             # the other goals are cancelled.
@@ -484,7 +483,7 @@ class LineSpeaker:
         self._report_unsent()
 
     def _cancel_goals(self, ids: list[str]) -> None:
-        """Cancel these and all other goals of this process, and report how they ended."""
+        """Cancel all goals of this process, and report how they ended."""
         self._options.urgent = True
         try:
             with self._options.connect(CANCEL_TIMEOUT_S, interrupt=self._interrupts.watched, end=None) as client:
@@ -505,7 +504,7 @@ class LineSpeaker:
             note(f"removed {recalled} waiting line{'s' * (recalled > 1)} from the queue")
 
     def _report_unsent(self) -> None:
-        """Print a message about the first line that wasn't sent or accepted, if any, unless --quiet is given."""
+        """Report the first line that wasn't sent or accepted, if any."""
         if self._options.quiet:
             return
         if self._sending is not None:

@@ -29,7 +29,7 @@ CANCEL_TIMEOUT_S = 1.0
 
 
 def seconds_left(end: float | None) -> float | None:
-    """Return how many seconds are left until a monotonic time, or None if there is no time limit."""
+    """Return the number of seconds left until a deadline."""
     return None if end is None else max(0.0, end - time.monotonic())
 
 
@@ -42,7 +42,7 @@ def timeout_error(timeout: float | None, details: str = "") -> TimedOut:
 
 
 class GoalReporter:
-    """Prints the ids, events and results of a command's goals, depending on the options."""
+    """Prints the ids, events and results of a command's goals."""
 
     def __init__(self, options: CommonOptions, *, feedback: bool) -> None:
         """Initialise the reporter. If `feedback` is true, it shows each event."""

@@ -40,8 +40,7 @@ __all__ = ["Client", "GoalHandle"]
 
 #: Number of bytes in a request that are reserved for everything except the list of ids.
 _REST_OF_LINE_BYTES = 4096
-#: The maximum sizes of a character in JSON: two bytes for an escaped ASCII character, such as a quote, and twelve bytes
-#: for any other character, which may be an escaped surrogate pair.
+#: The maximum size of an ASCII character, such as an escaped quote, and of any other character in JSON.
 _MAX_ASCII_BYTES, _MAX_CHARACTER_BYTES = 2, 12
 #: A `seq` with more digits than that of any real request.
 _LONG_SEQ = 10**15
@@ -300,10 +299,11 @@ class Client:
         return list(goals(items, "goal"))
 
     def voices(self) -> list[JsonObject]:
-        """Return the voices of the server's engine, as objects with `id`, `language`, `name`, `quality` and `speakers`.
+        """Return the voices of the server's engine.
 
-        The quality of a neural voice is a word such as "medium". Its speakers are a list of names, or None if there is
-        only one speaker. Other voices have None for both.
+        Each voice has the fields `id`, `language`, `name`, `quality` and `speakers`. The quality of a neural voice is a
+        word such as "medium". Its speakers are a list of names, or None if there is only one speaker. Other voices have
+        None for both.
         """
         _, items = self._connection.request(Voices())
         return [each["voice"] for each in items if isinstance(each.get("voice"), dict)]  # type: ignore[misc]
@@ -349,14 +349,14 @@ class Client:
         return settings if isinstance(settings, dict) else {}
 
     def pause(self) -> Goal | None:
-        """Pause all speech, and return the paused goal when it is silent, or None if no goal was being spoken.
+        """Pause all speech, and return the paused goal, if any, once it is silent.
 
         Nothing is spoken until any client calls `resume`. Pausing twice is no error.
         """
         return goal_in(self._connection.request(Pause())[0])
 
     def resume(self) -> Goal | None:
-        """Resume speech, and return the resumed goal, or None if no goal was paused.
+        """Resume speech, and return the resumed goal, if any.
 
         Resuming twice is no error.
         """
@@ -389,9 +389,10 @@ class Client:
     # -- internal
 
     def _create_handle(self, request: Say) -> tuple[GoalHandle, OnReply]:
-        """Check a new goal, and return its handle and the function that processes the server's reply.
+        """Check a new goal, and create its handle.
 
-        If the text is too long for a request, the goal is already REJECTED.
+        Also return the function that processes the server's reply. If the text is too long for a request, the goal is
+        already REJECTED.
 
         Raises:
             UsageError: a value is out of its range.
@@ -407,7 +408,7 @@ class Client:
         return handle, accepted
 
     def _full_id(self, goal_id: str) -> str:
-        """Return an id, prefixed with the boot id if it is only a number.
+        """Prefix an id with the boot id if it is only a number.
 
         Raises the same errors as `check_id`.
         """
@@ -430,7 +431,7 @@ class Client:
 
 
 def check_id(goal_id: str) -> None:
-    """Raise UsageError if an id is empty, or UnknownGoal if it is too long for any goal."""
+    """Raise an error if no goal can have this id."""
     if not goal_id:
         raise UsageError("the goal's id is empty; check the variable that should contain it")
     if len(goal_id) > MAX_ID_CHARS:
@@ -438,7 +439,7 @@ def check_id(goal_id: str) -> None:
 
 
 def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
-    """Split ids into groups, each of which fits into one request. Duplicates are removed."""
+    """Split ids into groups that fit into one request, without duplicates."""
     groups: list[list[str]] = []
     room = 0
     for each in dict.fromkeys(ids):
@@ -453,7 +454,7 @@ def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
 
 
 def check(request: Say | Set) -> None:
-    """Raise UsageError if an option of a request is invalid, using the same checks as the server."""
+    """Raise UsageError if an option of a request is invalid."""
     for option in request.options:
         try:
             fault = option.type_error(getattr(request, option.name))
@@ -466,7 +467,7 @@ def check(request: Say | Set) -> None:
 
 
 def too_long(request: Say) -> Goal | None:
-    """Return a REJECTED goal if the text is too long for a request, or None if it isn't.
+    """Return a REJECTED goal if the text is too long for a request.
 
     Raises:
         UsageError: `data` has no JSON form.

@@ -33,7 +33,7 @@ GREETING_WAIT_S = 0.2
 _LONGEST_YIELD_S = 0.2
 #: If an answer contains one of these, the goal will not be spoken.
 _REFUSALS = (b'"ok": false', b'"state": "REJECTED"')
-#: Time limit for a server's greeting, and for each answer. A busy server is tried again for as long.
+#: Time limit for a greeting, for each answer, and for attempts to reach a busy server.
 ANSWER_LIMIT_S = 5.0
 #: The minimum and maximum pause before trying again. The pause is random, so that refused clients don't all try again
 #: at the same moment.
@@ -60,9 +60,9 @@ class ConnectionAttempt:
     received: bytes = b""
     #: the part of the first request that has been sent
     request_sent: bytes = b""
-    #: the server's boot id, with which its goal ids begin, or "" if the greeting has not been read yet
+    #: the server's boot id, or "" before the greeting has been read
     boot: str = ""
-    #: the server's process id, or None if the greeting has not been read yet
+    #: the server's process id, or None before the greeting has been read
     pid: int | None = None
 
     @property
@@ -74,7 +74,7 @@ class ConnectionAttempt:
 def reach(
     named: str | None, failures: tuple[tuple[str, Exception], ...] = (), only: str | None = None
 ) -> ConnectionAttempt:
-    """Try to connect to the first usable socket, without sending anything, and return the attempt.
+    """Try to connect to the first usable socket, without sending anything.
 
     Args:
         named: path of the only socket to try, as the user named it; None for the usual places.
@@ -166,7 +166,7 @@ def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> None:
     connected.settimeout(pause)
     try:
         answer = connected.recv(65536, _socket.MSG_PEEK)
-    except OSError:  # there is no answer yet, or the connection broke, which the next read reports
+    except OSError:  # no answer has arrived; if the connection broke, the next read reports it
         answer = b""
     connected.setblocking(False)
     if answer and not any(each in answer for each in _REFUSALS):
@@ -174,7 +174,7 @@ def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> None:
 
 
 def sender_name(name: str | None) -> str | None:
-    """Return the given name, or else the value of TALK_NAME, or None if it isn't set."""
+    """Return the given name, or else the value of TALK_NAME."""
     # Cancelling must work even if the variable is not valid UTF-8.
     variable = os.environ.get("TALK_NAME", "").encode(errors="surrogateescape").decode(errors="replace")
     return name or variable or None
@@ -201,7 +201,7 @@ def connect(
     keep_trying: float = 0.0,
     end: float | None = None,
 ) -> ConnectionAttempt:
-    """Connect to the first usable server, read its greeting, and return the attempt.
+    """Connect to the first usable server, and read its greeting.
 
     Retry for a limited time.
 
@@ -251,7 +251,7 @@ def connect(
 
 
 def _server_may_start(attempt: ConnectionAttempt) -> bool:
-    """Return whether a server could still be starting at one of the paths that could not be used."""
+    """Return whether a server may still be starting at one of the paths."""
     found = {paths.describe_place(path, error) for path, error in attempt.failures if isinstance(error, OSError)}
     return not found.isdisjoint({paths.PLACE_ABSENT, paths.PLACE_STALE})
 
@@ -259,7 +259,7 @@ def _server_may_start(attempt: ConnectionAttempt) -> bool:
 def _greet(
     attempt: ConnectionAttempt, hello: JsonObject, end: float, interrupt: Mapping[int, int] | None
 ) -> ConnectionAttempt:
-    """Send hello if it has not been sent yet, read the server's greeting, and return the updated attempt.
+    """Send hello if necessary, and read the server's greeting.
 
     The connection is closed if the greeting has not arrived by `end` (monotonic), and after any other error.
 
@@ -299,7 +299,7 @@ def _greet(
 
 
 def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
-    """Return an error that lists the sockets that could not be used and advises the user."""
+    """Return an error that lists the unusable sockets and gives advice."""
     if attempt.backlog_full:
         path = attempt.failures[-1][0]
         return ServerUnavailable(f"the server at {path} doesn't accept connections; restart it if it hangs")

@@ -41,7 +41,7 @@ _RECONNECT_PAUSE_S = 0.1
 
 
 def checked_sender_name(name: str | None) -> str | None:
-    """Return the given name or the one in TALK_NAME, if there is one.
+    """Return the given name, or else the value of TALK_NAME.
 
     Raises UsageError if the name is too long.
     """
@@ -260,12 +260,12 @@ class Connection(ClientCore):
                     self.changed.notify_all()
 
     def _read_available(self) -> None:
-        """Process the messages that have already arrived, and notice if the connection has ended."""
+        """Process all messages that have already arrived."""
         for _ in range(2):  # the end of the connection can only be read after the last messages
             self.wait_until(lambda: False, time.monotonic(), interruptible=False)
 
     def _cut_off(self) -> None:
-        """Break the connection, because a line could only be sent in part.
+        """Break the connection after a line was sent only in part.
 
         The caller must hold the lock `changed`.
         """
@@ -318,7 +318,7 @@ class SocketConnection(Connection):
         keep_trying: float = 0.0,
         end: float | None = None,
     ) -> None:
-        """Connect to a server. The errors are those of `Client`.
+        """Connect to a server.
 
         Args:
             socket: path of the server's socket. The default is TALK_SOCKET, or else the usual places.
@@ -353,7 +353,7 @@ class SocketConnection(Connection):
         return None if self._socket is None else peers.credentials(self._socket)[0]
 
     def _send(self, exchange: Exchange) -> None:
-        """Queue the request of a registered exchange, and send as many bytes as the server accepts now."""
+        """Queue an exchange's request, and send as many bytes as the server accepts."""
         line = self.line(exchange)
         if exchange.on_failure and self.unsent_bytes + len(line) > MAX_UNSENT_BYTES:
             words = f"{MAX_UNSENT_BYTES >> 10} KiB are already waiting for the server at {self.path}"
@@ -437,9 +437,9 @@ class ReconnectingConnection(SocketConnection):
         self._due = 0.0
 
     def begin(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> Exchange:
-        """Send a request, after reconnecting if necessary, and return its exchange without waiting."""
+        """Send a request, after reconnecting if necessary."""
         if on_failure is None:
-            self._read_available()  # notices if the connection has broken
+            self._read_available()  # this detects a broken connection
         with self.changed:
             if self.ended is None:
                 self._connect_again(time.monotonic(), at_once=isinstance(request, Cancel))
@@ -493,7 +493,7 @@ class ReconnectingConnection(SocketConnection):
             self._schedule_retry(error, now)
 
     def _connect_again(self, now: float, *, at_once: bool = False) -> None:
-        """Reconnect if disconnected and the pause between attempts is over.
+        """Reconnect if the pause between attempts is over.
 
         `at_once` ignores the pause.
         """

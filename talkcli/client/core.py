@@ -67,7 +67,7 @@ class EventBuffer:
         self._last_number: int | None = None
         #: why the buffer was closed, or None while it is open
         self.closed: str | None = None
-        #: whether the buffer is still used after the client has reconnected
+        #: whether to keep the buffer after reconnecting
         self.reconnects = reconnects
 
     def add(self, event: Event) -> None:
@@ -110,12 +110,12 @@ class EventListeners:
         self.watches: WeakSet[EventBuffer] = WeakSet()
 
     def add(self, tracked: TrackedGoal) -> None:
-        """Pass a goal's events and all pauses to `tracked`, until the goal has ended or is lost."""
+        """Pass a goal's events and all pauses to `tracked`."""
         self._goals.setdefault(tracked.goal.id, set()).add(tracked)
 
     @property
     def goals(self) -> dict[str, bool]:
-        """Maps the id of each followed goal to whether any of its followers receives words."""
+        """The ids of the followed goals, and whether each needs words."""
         return {goal_id: any(each._with_feedback for each in some) for goal_id, some in self._goals.items()}
 
     def lose(self, goal_id: str, why: str) -> None:
@@ -182,7 +182,7 @@ class TrackedGoal:
         self._buffer = EventBuffer()
 
     def _expect(self, request: Say, now: float) -> None:
-        """Copy the id and text of an unanswered `say` request, and record whether it asks for events."""
+        """Prepare the goal for an unanswered `say` request."""
         self.goal = replace(self.goal, id=request.id or "", text=request.text)
         if request.wait:
             self._followed_at = now
@@ -194,7 +194,7 @@ class TrackedGoal:
         self.speech_paused = reply.get("paused") is True
 
     def _listen_to(self, listeners: EventListeners, *, feedback: bool, now: float) -> None:
-        """Start to receive the goal's events, which the server sends from `now` on."""
+        """Record that the server sends the goal's events from now on."""
         self._with_feedback = self._with_feedback or feedback
         if self._followed_at is None:
             self._followed_at = now
@@ -202,7 +202,7 @@ class TrackedGoal:
             listeners.add(self)
 
     def _fail(self, error: TalkError) -> None:
-        """End the goal after a failed `say`: as LOST if it may still be spoken, otherwise as REJECTED."""
+        """End the goal as LOST or REJECTED after a failed `say` request."""
         from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
 
         if isinstance(error, Lost):
@@ -213,7 +213,7 @@ class TrackedGoal:
             self._update(replace(self.goal, state=State.REJECTED, reason=reason, message=message))
 
     def _mark_lost(self, why: str) -> None:
-        """End the goal as LOST, unless it has already ended. `why` is a human-readable reason."""
+        """End the goal as LOST, unless it has already ended."""
         from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
 
         self._update(replace(self.goal, state=State.LOST, reason=Reason.LOST.value, message=f"result unknown: {why}"))
@@ -224,7 +224,7 @@ class TrackedGoal:
             self.goal = goal
 
     def _hear(self, event: StateChanged | WordHeard | PausedChanged | Goal) -> None:
-        """Update the goal from an event or from its state after reconnecting, and buffer the event."""
+        """Update the goal from an event, and buffer the event."""
         if self.goal.state.terminal:
             return
         if isinstance(event, Goal):
@@ -249,7 +249,7 @@ class TrackedGoal:
         return self.goal.state.terminal or bool(self._buffer)
 
     def _take(self) -> Event | None:
-        """Remove and return the oldest event, or the Result after the last event.
+        """Remove and return the next event, ending with the Result.
 
         Return None if nothing is new.
         """
@@ -281,13 +281,13 @@ def read_greeting(line: bytes, path: str) -> tuple[str, int | None]:
 
 
 def identity(server: JsonObject) -> tuple[str, int | None]:
-    """Return a server's boot id and process id, from its greeting or its status."""
+    """Return the boot id and process id from a server's greeting or status."""
     boot, pid = server.get("boot"), server.get("pid")
     return boot if isinstance(boot, str) else "", pid if isinstance(pid, int) else None
 
 
 class Exchange:
-    """A request of a client and its answer, which consists of list items and a reply."""
+    """A client's request and the server's answer to it."""
 
     def __init__(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> None:
         """Create an exchange, which must be registered before the request is sent.
@@ -309,7 +309,7 @@ class Exchange:
         self.reply: JsonObject | None = None
         #: the error, if the request failed
         self.error: TalkError | None = None
-        #: monotonic time of the last received line, or of the beginning of the exchange
+        #: monotonic time of the last received line; before the first line, that of the start
         self.heard_at = 0.0
 
     @property
@@ -360,9 +360,9 @@ class ClientCore:
         self._splitter = LineSplitter()
         #: monotonic time at which bytes were last received
         self._heard = now
-        #: the lines that are waiting to be sent, with their exchanges
+        #: unsent lines, each with its exchange
         self._unsent: deque[tuple[bytes, Exchange]] = deque()
-        #: number of bytes of the first waiting line that have already been sent
+        #: how many bytes of the first unsent line have been sent
         self._first_sent_bytes = 0
         #: the unsent part of the hello line, which is sent before the server's greeting arrives
         self._hello = b""
@@ -386,7 +386,7 @@ class ClientCore:
         return request_line({"seq": exchange.number, **write_request(exchange.request)})
 
     def queue(self, line: bytes, exchange: Exchange) -> None:
-        """Append the line of an exchange to the bytes that are waiting to be sent.
+        """Queue an exchange's line for sending.
 
         Raises:
             ServerUnavailable: nothing more can be sent.
@@ -406,7 +406,7 @@ class ClientCore:
         return sum(len(line) for line, _ in self._unsent) - self._first_sent_bytes
 
     def outgoing(self) -> bytes:
-        """Return the bytes that can be sent now: the hello line or, after the server's greeting, the requests."""
+        """Return the bytes that can be sent now."""
         if self._hello or not self.greeted:
             return self._hello
         return b"".join(line for line, _ in self._unsent)[self._first_sent_bytes :]
@@ -442,7 +442,7 @@ class ClientCore:
         return True
 
     def stop_sending(self, why: str) -> None:
-        """Fail all unsent and later requests, for this reason.
+        """Fail all unsent and later requests.
 
         Answers to earlier requests can still be received.
         """
@@ -453,7 +453,7 @@ class ClientCore:
             self.fail(exchange, self.unanswered(exchange))
 
     def answer(self, exchange: Exchange) -> tuple[JsonObject, list[JsonObject]]:
-        """Return the reply to a request and the items that came before it, or raise the request's error.
+        """Return the reply to a request and its list items, or raise its error.
 
         Raises:
             RequestRefused: the server refused the request.
@@ -465,7 +465,7 @@ class ClientCore:
         return exchange.reply, exchange.items
 
     def unanswered(self, exchange: Exchange) -> TalkError:
-        """Return the error for an unanswered request, which says whether the request was sent."""
+        """Return the error for an unanswered request."""
         request = exchange.request
         why = self.ended or (self.absence if self.absent_since is not None else "")
         if not exchange.sent:
@@ -493,7 +493,7 @@ class ClientCore:
     # -- time limits
 
     def answer_deadline(self, exchange: Exchange) -> float:
-        """Return the time by which a request must be sent, or by which the next line of its answer must arrive."""
+        """Return the time at which an exchange without progress fails."""
         if exchange.sent:
             return float("inf") if exchange.slow else exchange.heard_at + self._patience
         ttl = exchange.request.ttl if isinstance(exchange.request, Say) else None
@@ -510,7 +510,7 @@ class ClientCore:
         return max(began, self._heard) + SILENCE_LIMIT_S, f"the server sent nothing for {SILENCE_LIMIT_S:g} s"
 
     def goals_lost_at(self) -> float:
-        """Return the time at which followed goals become LOST if the client hasn't reconnected."""
+        """Return the time at which followed goals become LOST while disconnected."""
         return float("inf") if self.absent_since is None else self.absent_since + self._patience
 
     def next_expiry(self) -> float:
@@ -539,7 +539,7 @@ class ClientCore:
     # -- receiving
 
     def split(self, data: bytes, now: float) -> list[bytes]:
-        """Add received bytes, record their time, and return the lines that are now complete.
+        """Add received bytes, and return the lines that are now complete.
 
         Transports that pass lines on without decoding them use this method instead of `receive`.
         """
@@ -597,7 +597,7 @@ class ClientCore:
         return exchange
 
     def _finish(self, exchange: Exchange, reply: JsonObject) -> None:
-        """End an exchange with its reply, or with an error if the reply is a refusal.
+        """End an exchange after its reply has arrived.
 
         Calls the callbacks.
 
@@ -621,7 +621,7 @@ class ClientCore:
     # -- disconnecting and reconnecting
 
     def break_off(self, why: str, now: float) -> None:  # noqa: ARG002 - for subclasses that reconnect
-        """Break the connection. This ends it for good, unless a subclass reconnects."""
+        """End the connection for good, unless a subclass reconnects."""
         self.end(why)
 
     def end(self, why: str) -> None:
@@ -648,7 +648,7 @@ class ClientCore:
         self.listeners.end_watches(why, include_reconnecting=False)
 
     def connecting(self, hello: bytes) -> None:
-        """Prepare for a new connection, on which `hello` is sent first.
+        """Prepare for a new connection, which begins with `hello`.
 
         Requests wait for the server's greeting.
         """
@@ -656,7 +656,7 @@ class ClientCore:
         self.begin_stream()
 
     def not_connected(self, error: TalkError) -> None:
-        """Record that an attempt to reconnect has failed, and fail all requests without an `on_failure`."""
+        """Record a failed attempt to reconnect, and fail requests that callers wait for."""
         self.connect_error = error
         for exchange in [each for each in self.exchanges.values() if not each.on_failure]:
             self.forget(exchange)
@@ -688,7 +688,7 @@ class ClientCore:
             self.queue(self._renew_line(exchange, now), exchange)
 
     def _renew_line(self, exchange: Exchange, now: float) -> bytes:
-        """Reduce a waiting request's TTL by the time waited, restart its time limit, and return its line."""
+        """Return a waiting request's line, with its TTL reduced by the time waited."""
         request = exchange.request
         if isinstance(request, Say) and request.ttl:
             exchange.request = replace(request, ttl=max(MIN_TTL_S, request.ttl - (now - exchange.heard_at)))
@@ -704,7 +704,7 @@ class ClientCore:
                     self.listeners.update(goal)
 
         def on_failure(error: TalkError) -> None:
-            if self.absent_since is None:  # after another break, the next connection follows the goal
+            if self.absent_since is None:  # if the connection breaks again, the next one follows the goal
                 self.listeners.lose(goal_id, f"{error.message}; the sentence may have been spoken")
 
         self._begin(Exchange(Wait((goal_id,), feedback), on_reply, on_failure), now)
@@ -727,7 +727,7 @@ class ClientCore:
         self.queue(self.line(exchange), exchange)
 
     def fail(self, exchange: Exchange, error: TalkError) -> None:
-        """End an exchange with an error and call its `on_failure`, unless the exchange has already ended."""
+        """End an exchange with an error, unless it has already ended."""
         if exchange.over:
             return
         exchange.error = error
@@ -747,6 +747,6 @@ class ClientCore:
             self.listeners.lose(goal_id, f"{self.absence}; the sentence may still be spoken")
 
     def _drop_unsent_lines(self) -> None:
-        """Remove all lines that are waiting to be sent. Their exchanges don't fail."""
+        """Remove all unsent lines, without failing their exchanges."""
         self._unsent.clear()
         self._first_sent_bytes = 0

@@ -189,7 +189,7 @@ class GoalHandle(TrackedGoal):
                 yield event
 
     def _follow(self, *, feedback: bool) -> None:
-        """Ask the server to send the goal's events, unless it already does or the goal has ended."""
+        """Ask the server to send the goal's events, if necessary."""
         if self.state.terminal or (self._followed_at is not None and (self._with_feedback or not feedback)):
             return
 
@@ -217,7 +217,7 @@ class GoalHandle(TrackedGoal):
 
 
 def merged(handles: Sequence[GoalHandle], timeout: float | None = None) -> Iterator[tuple[GoalHandle, Event]]:
-    """Yield the events of several goals, each with its goal's handle, until all of the goals have ended.
+    """Yield the events of several goals until all of them have ended.
 
     The last event of each goal is its Result. A pause of all speech is yielded only once. If the connection ends, the
     remaining goals end as LOST.
@@ -252,7 +252,7 @@ class _EventStream:
         self.unfinished = list({each.id: each for each in handles}.values())
         #: the number of each goal's last event
         self._last_numbers: dict[str, int] = {}
-        #: the number of the last pause, which is yielded only once although every goal receives it
+        #: the number of the last pause. Every goal receives it, but it is yielded only once.
         self._last_pause = 0
 
     def take(self) -> list[tuple[GoalHandle, Event]]:
@@ -281,5 +281,5 @@ class _EventStream:
 
 
 def _end_time(timeout: float | None) -> float | None:
-    """Return the monotonic time at which a timeout expires, or None if there is no timeout."""
+    """Return the monotonic time at which a timeout expires."""
     return None if timeout is None else time.monotonic() + timeout

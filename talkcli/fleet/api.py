@@ -87,10 +87,10 @@ class Fleet:
         return Client.over(connect_robot(name, self._broker, name=self._name))
 
     def say(self, to: str, text: str, *, wait: bool = True, ttl: float | None = None, **options: Any) -> FleetRequest:
-        """Speak a text on each robot, and return the request, which yields the outcomes.
+        """Speak a text on each robot.
 
-        The goal has the same id on all robots. To cancel it, call `cancel` on the returned FleetRequest. After the last
-        outcome, call `Fleet.cancel` with the id instead.
+        Return the request, which yields the outcomes. The goal has the same id on all robots. To cancel it, call
+        `cancel` on the returned FleetRequest. After the last outcome, call `Fleet.cancel` with the id instead.
 
         Args:
             to: the name of a robot, a pattern or a group.
@@ -142,7 +142,7 @@ class Fleet:
         return self._send_request(to, Pause())
 
     def resume(self, to: str) -> FleetRequest:
-        """Resume paused speech on each robot. Return the request, which yields the outcomes."""
+        """Resume paused speech on each robot, and return the request."""
         return self._send_request(to, Resume())
 
     def set(self, to: str, **settings: Any) -> FleetRequest:

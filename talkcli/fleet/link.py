@@ -227,7 +227,7 @@ class Link:
                 self._paho.loop_misc()
 
     def publish(self, message: Message, qos: int = 1, acknowledged: OnAcknowledged | None = None) -> bool:
-        """Publish a message, and return whether the connection was still open.
+        """Publish a message if the connection is still open.
 
         Args:
             message: the message. Its payload has at most `max_payload_bytes`.
@@ -280,14 +280,14 @@ class Link:
                 self._socket = None
 
     def drop(self) -> None:
-        """Close a forked child's copy of the descriptor. The parent process stays connected."""
+        """Close a forked child's copy of the descriptor."""
         if self._socket is not None:
             os.close(self._socket.detach())
 
     # -- internals
 
     def _tls_pending(self) -> bool:
-        """Return whether the TLS layer holds decrypted data, which polling can't detect."""
+        """Return whether the TLS layer holds unread data."""
         return isinstance(self._socket, ssl.SSLSocket) and self._socket.pending() > 0
 
     def _login_error(self) -> TalkError | None:
@@ -316,7 +316,7 @@ class Link:
     def _on_connect(
         self, _client: paho.Client, _data: object, _flags: object, code: ReasonCode, properties: Properties | None
     ) -> None:
-        """Store the broker's response to the login, and the size of the largest payload that it accepts."""
+        """Store the broker's response to the login, and its size limit."""
         self._answer = code
         # Turn off paho's log, which is only needed to explain a failed login. It would use a tenth of the CPU time.
         self._paho.on_log = None

@@ -50,7 +50,7 @@ class Sender:
 
 @frozen
 class By:
-    """The goal or client that ended or rejected a goal, or the client that paused or resumed speech.
+    """The goal or client that ended a goal, or the client that paused or resumed speech.
 
     Both fields are None if the server itself ended the goal.
     """
@@ -59,7 +59,7 @@ class By:
     client: Sender | None = None
 
     def to_json(self) -> JsonObject | None:
-        """Return a JSON object with the goal or the client, or None if both are None."""
+        """Return a JSON object with the goal or the client."""
         if self.goal is not None:
             return {"goal": self.goal}
         return None if self.client is None else {"client": self.client.to_json()}
@@ -187,13 +187,13 @@ def read_fields(cls: type, message: object) -> dict[str, Any]:
 
 
 def message_details(message: str | None) -> str:
-    """Return a goal's message, but without a prefix such as "speech failed: ", which only repeats the state."""
+    """Return a goal's message without a prefix such as "speech failed: "."""
     head, _, details = (message or "").partition(": ")
     return details if head in _STATE_WORDS else message or ""
 
 
 def _reader(kind: type) -> Callable[[object], object]:
-    """Return a function that returns its argument if it has exactly this type, and None otherwise."""
+    """Create a function that turns values of any other type into None."""
     return lambda value: value if type(value) is kind else None
 
 

@@ -53,7 +53,7 @@ class History:
         self._text_bytes = 0
 
     def add(self, record: Record) -> None:
-        """Add an ended goal. If a limit is exceeded, drop the oldest goals or texts."""
+        """Add an ended goal, and drop old goals or texts if there are too many."""
         limits = {State.REJECTED: MAX_REJECTED_GOALS, State.RECALLED: MAX_RECALLED_GOALS}
         ids = self._ids[record.state if record.state in limits else State.SUCCEEDED]
         ids.append(record.id)
@@ -71,7 +71,7 @@ class History:
         return self._all.get(goal_id)
 
     def latest(self, count: int, *, rejected: bool) -> list[Record]:
-        """Return the most recently ended goals, oldest first, with or without REJECTED goals.
+        """Return the most recently ended goals, oldest first.
 
         Args:
             count: the maximum number of goals.
@@ -85,7 +85,7 @@ class SpeechTimes:
     """Remembers when each key and each text was last spoken."""
 
     def __init__(self) -> None:
-        #: start time and id of the last goal, by its key and by a hash of its text
+        #: start time and id of the last goal for each key and each hash of a text
         self._starts: OrderedDict[str | bytes, tuple[float, str]] = OrderedDict()
 
     def add(self, record: Record) -> None:
@@ -98,7 +98,7 @@ class SpeechTimes:
                 _set_newest(self._starts, each, (record.began_at, record.id), MAX_SPEECH_TIMES)
 
     def last_goal_id(self, since: float, key: str | None, text: str) -> str | None:
-        """Return the id of the last goal after `since` with this key, or with this text if the key is None.
+        """Return the id of the last goal with a key or, without a key, with a text.
 
         Return None if no goal started after `since` (monotonic) with this key or text.
         """
@@ -118,7 +118,7 @@ class EarlyCancels:
         _set_newest(self._cancels, goal_id, (now + EARLY_CANCEL_S, by), MAX_EARLY_CANCELS)
 
     def find(self, goal_id: str | None, now: float) -> By | None:
-        """Return the client that cancelled this goal id, or None if there was no recent cancel."""
+        """Return the client that recently cancelled a goal id, if any."""
         lapses_at, by = self._cancels.get(goal_id, (now, None))
         return by if now < lapses_at else None
 

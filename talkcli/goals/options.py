@@ -202,7 +202,7 @@ class Option:
 
     @property
     def flags(self) -> str:
-        """Command-line flags, or an empty string if the option isn't available on the command line."""
+        """Command-line flags, or an empty string if there are none."""
         return self.special_flags or (f"--{self.name.replace('_', '-')}" if self.help else "")
 
     def type_error(self, value: Any) -> str | None:
@@ -242,13 +242,13 @@ class Option:
         return f"more than {low:g}" if self.excludes_minimum else f"{low:g} or more"
 
     def for_set(self) -> Option:
-        """Return a copy for `talk set`, with that command's flags and help, but without an environment variable."""
+        """Return a copy for `talk set`, with that command's flags and help."""
         setting = self.setting
         assert setting
         return replace(self, env="", special_flags=setting.flags or self.flags, help=setting.set_help or self.help)
 
     def for_serve(self) -> Option:
-        """Return a copy for `talk serve`, with that command's flags and help, and with the initial value."""
+        """Return a copy for `talk serve`, with that command's flags, help and default."""
         setting = self.setting
         assert setting
         flags = (setting.flags or self.flags).split("/")[0]
@@ -547,7 +547,7 @@ class Set:
 
 @frozen
 class Cancel:
-    """A request to cancel every goal that matches at least one field, or all goals if no field is set.
+    """A request to cancel all goals, or only those that match at least one field.
 
     Goals that wait for room in the queue (`patient`) are cancelled, too.
     """
@@ -594,7 +594,7 @@ class Cancel:
         return self.ids is None and not self.current and self.before is None and self.key is None
 
     def select_waiting(self, goals: Sequence[Say]) -> list[int]:
-        """Return the indexes of the goals to cancel in a list of goals that wait for room in the queue.
+        """Return the indexes of the waiting goals that the request cancels.
 
         Such goals have an id only if their sender chose one, so `before` selects them only if it names such an id.
         """
@@ -680,7 +680,7 @@ def shown_settings(settings: Set) -> JsonObject:
 
 
 def _replace_none_values(values: dict[str, Any]) -> dict[str, Any]:
-    """Return a copy of settings or options in which values that mean "none" are None."""
+    """Return a copy of settings in which None replaces values that mean "none"."""
     return {name: None if value == _NONE_VALUES.get(name) else value for name, value in values.items()}
 
 

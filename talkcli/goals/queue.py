@@ -69,7 +69,7 @@ class Queue:
         return list(map(_record_of, self._goals[bisect_left(self._goals, (-priority,)) :]))
 
     def preempting_goals_up_to(self, priority: int) -> list[Record]:
-        """Return all goals that interrupt others (`preempt`) and have this priority or a lower one."""
+        """Return all preempting goals with this priority or a lower one."""
         return list(map(_record_of, self._preempting[bisect_left(self._preempting, (-priority,)) :]))
 
     def displaceable_goal(self) -> Record | None:
@@ -80,7 +80,7 @@ class Queue:
         return self._displaceable[-1][2] if self._displaceable else None
 
     def add(self, record: Record, replaced: Record | None = None) -> None:
-        """Add a goal behind the others of its priority, in front of them if it preempts, or in place of another.
+        """Add a goal at its place in the speaking order.
 
         Args:
             record: the new goal.
@@ -109,7 +109,7 @@ class Queue:
         return list(map(_record_of, self._expiries[: bisect_left(self._expiries, (now, inf))]))
 
     def _entries(self, record: Record) -> Iterator[tuple[list[_Entry], _Entry]]:
-        """Yield every sorted list that a goal belongs to, together with the entry for that list."""
+        """Yield each sorted list that contains a goal, with the goal's entry."""
         entry = -record.say.priority, record.position, record
         yield self._goals, entry
         yield self._displaceable, (-record.say.priority, record.number, record)

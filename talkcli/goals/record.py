@@ -72,7 +72,7 @@ class Record:
         return len(self.say.text.encode(errors="surrogatepass"))
 
     def change_state(self, state: State) -> None:
-        """Change the state of the goal. Raises IllegalTransition if the change isn't allowed."""
+        """Change the state of the goal, or raise IllegalTransition."""
         if state not in TRANSITIONS[self.state]:
             raise IllegalTransition(f"a goal can't change from {self.state.name} to {state.name}")
         self.state = state
@@ -82,11 +82,11 @@ class Record:
         self.text_hash, self.say = hash(self.say.text), replace(self.say, text="")
 
     def has_text(self, text: str) -> bool:
-        """Return whether the goal has this text. If the text was dropped, compare hashes."""
+        """Return whether the goal has this text."""
         return text == self.say.text if self.text_hash is None else hash(text) == self.text_hash
 
     def snapshot(self, state: State | None = None) -> Goal:
-        """Return an immutable copy of the goal, with the current state or another one.
+        """Return an immutable copy of the goal.
 
         Args:
             state: the state to show instead of the current one. With PENDING, the copy shows the goal as it was

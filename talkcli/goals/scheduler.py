@@ -49,7 +49,7 @@ class Now:
 
 @frozen
 class StateChange:
-    """An effect for the caller to carry out: publish the new state of a goal."""
+    """An effect that publishes the new state of a goal."""
 
     record: Record
     state: State
@@ -70,7 +70,7 @@ class Order(Enum):
 
 @frozen
 class EngineOrder:
-    """An effect for the caller to carry out: send the engine an order."""
+    """An effect that gives the engine an order."""
 
     record: Record
     order: Order
@@ -126,7 +126,7 @@ class Scheduler:
         self.active: Record | None = None
         #: whether speech is paused
         self.paused = False
-        #: whether goals can start, even if each one fails at once because no engine can be started
+        #: whether goals can start, or fail at once because there is no engine
         self.has_engine = False
         #: whether `shutdown` was called; if so, new goals are rejected
         self.closing = False
@@ -144,11 +144,11 @@ class Scheduler:
         return ([self.active] if self.active else []) + list(self.pending)
 
     def find(self, goal_id: str) -> Record | None:
-        """Return the goal with this id, or None. Goals that ended long ago are forgotten."""
+        """Return the goal with this id, or None if it is unknown."""
         return self._by_id.get(goal_id) or self.history.find(goal_id)
 
     def has_room(self, say: Say) -> bool:
-        """Return whether the queue has room for a goal, or can make room.
+        """Return whether the queue has or can make room for a goal.
 
         A known id needs no room.
         """
@@ -262,7 +262,7 @@ class Scheduler:
         return result
 
     def change_settings(self, changes: dict[str, object], now: Now) -> list[Effect]:
-        """Change the settings for goals that have not started, and request a new voice.
+        """Change the settings for goals that have not started.
 
         Return the effects.
 
@@ -276,7 +276,7 @@ class Scheduler:
         return self.tick(now)  # the next goal may not have to wait for its voice any more
 
     def pause(self) -> list[Effect]:
-        """Prevent other goals from starting, and return the order to pause the active goal, if any."""
+        """Pause the active goal, and prevent others from starting."""
         if self.paused:
             return []
         self.paused = True
@@ -287,7 +287,7 @@ class Scheduler:
         return [EngineOrder(self.active, Order.HOLD)]
 
     def resume(self, now: Now) -> list[Effect]:
-        """End the pause. Return the effects that resume the paused goal or start the next one."""
+        """End the pause, and resume the paused goal or start the next one."""
         if not self.paused:
             return []
         self.paused = False
@@ -312,7 +312,7 @@ class Scheduler:
     # -- reports from the engine
 
     def engine_lost(self, now: Now) -> list[Effect]:
-        """Record that the engine process has exited, so that no goal starts.
+        """Record that the engine process has exited.
 
         Return warnings about voices.
         """
@@ -320,14 +320,14 @@ class Scheduler:
         return [*self.voices.engine_lost(now.monotonic)]
 
     def engine_ready(self, now: Now) -> list[Effect]:
-        """Record that an engine is ready, and return the orders to start the next goal and to load the next voice."""
+        """Record that an engine is ready, and start the next goal."""
         self.has_engine = self._loads_voices = True
         for voice in (*self._needed_voices(), self.settings.voice or ""):
             self._request_voice(voice, now)
         return self._start_next(now) + self._order_next_voice(now)
 
     def engine_unavailable(self, now: Now) -> list[Effect]:
-        """Record that no engine can be started, so that goals fail at once.
+        """Record that no engine can be started.
 
         Return the effects.
         """
@@ -335,7 +335,7 @@ class Scheduler:
         return self._start_next(now)
 
     def fail_next(self, message: str, now: Now) -> list[Effect]:
-        """Fail the next goal, unless an engine is available, and return the effects.
+        """Fail the next goal, unless an engine is available.
 
         Called after a long wait for an engine.
         """
@@ -365,7 +365,7 @@ class Scheduler:
         return self._order_next_voice(now)
 
     def output_changed(self, goal_id: str, output: Output | None) -> None:
-        """Record the audio output of the active goal, or None if it is unknown."""
+        """Record the audio output of the active goal."""
         self._require_active(goal_id).output = output
 
     def completed(
@@ -459,7 +459,7 @@ class Scheduler:
         return min(self._active_deadline(), self.pending.next_expiry(), self._next_deadline())
 
     def tick(self, now: Now) -> list[Effect]:
-        """Handle all time limits that have been reached, and return the effects.
+        """Handle all time limits that have been reached.
 
         Expired goals are recalled. If the active goal was stopped and did not become silent in time, it is aborted. The
         next goal starts if it no longer has to wait for its voice.
@@ -480,7 +480,7 @@ class Scheduler:
     # -- selecting and accepting goals
 
     def _select(self, selection: Cancel, result: Cancellation, waiting: Collection[str | None]) -> list[Record]:
-        """Return the unfinished goals that a cancel selects, and add ended goals and unknown ids to `result`."""
+        """Return the unfinished goals that a cancel selects, and record the others in `result`."""
         chosen = self.unfinished() if selection.selects_all else []
         for goal_id in dict.fromkeys(selection.ids or ()):
             record = self.find(goal_id)
@@ -523,7 +523,7 @@ class Scheduler:
         return options.bad_text(say.text, self.max_text) or refusal
 
     def _throttle(self, say: Say, record: Record, now: Now) -> Refusal | None:
-        """Return the reason if a goal repeats another one too soon, otherwise None.
+        """Return a refusal if a goal repeats another one too soon.
 
         May set `record.by`.
 
@@ -547,11 +547,11 @@ class Scheduler:
         return Reason.THROTTLED, f"{what} {words}"
 
     def _preempts(self, say: Say) -> bool:
-        """Return whether a goal interrupts others, by its own options or by the server's setting."""
+        """Return whether a goal interrupts others."""
         return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)
 
     def _find_room(self, say: Say) -> list[tuple[Record, Reason]] | None:
-        """Return the goals that a new goal would remove from the queue, with reasons, or None if it doesn't fit."""
+        """Return the goals that a new goal removes from the queue, if it fits."""
         replaced = self.pending.with_key(say.key)
         preempted: list[Record] = []
         if say.flush:
@@ -619,7 +619,7 @@ class Scheduler:
         return [order] if order else []
 
     def _order_voice_drops(self) -> list[Effect]:
-        """Return orders to drop voices if they use too much memory, and record them as dropped."""
+        """Drop voices if they use too much memory, and return the orders."""
         needed = self._needed_voices()
         speaking = options.without_speaker(self.active.voice) if self.active else ""
         if options.is_neural(speaking) and not self.voices.is_loaded(speaking):
@@ -629,14 +629,14 @@ class Scheduler:
     # -- starting and ending goals
 
     def _expire(self, now: Now) -> list[Effect]:
-        """Recall all pending goals that have expired, and return the effects."""
+        """Recall all pending goals that have expired."""
         effects: list[Effect] = []
         for record in self.pending.expired(now.monotonic):
             effects += self._recall(record, Reason.EXPIRED, _expiry_message(record), None, now)
         return effects
 
     def _active_deadline(self) -> float:
-        """Return the monotonic time of the active goal's next time limit, or inf if it has none.
+        """Return the monotonic time of the active goal's next time limit.
 
         If the goal is being stopped, it must be silent by then. Otherwise, it expires then, but only if the engine was
         lost before anything was heard, because the goal must start again.
@@ -649,18 +649,18 @@ class Scheduler:
         return inf if self.has_engine or goal.spoken_end else goal.expires_at
 
     def _next_deadline(self) -> float:
-        """Return the monotonic time at which `tick` must try to start the next goal, or inf if none can start."""
+        """Return the monotonic time at which to try to start the next goal."""
         record = None if self.active or self.paused or not self.has_engine else self.pending.first()
         if record is None:
             return inf
         return 0.0 if record.next_since == inf else self._start_time(record)
 
     def _start_time(self, record: Record) -> float:
-        """Return the monotonic time until which a goal waits for its voice, or 0 if it doesn't wait."""
+        """Return the monotonic time until which a goal waits for its voice."""
         return self.voices.start_time(record, self.settings.voice) if self._loads_voices else 0.0
 
     def _start_next(self, now: Now) -> list[Effect]:
-        """Make the next goal ACTIVE if possible.
+        """Start the next goal if possible.
 
         Return the effects, including the order to speak it.
         """
@@ -692,17 +692,17 @@ class Scheduler:
         return record, [*effects, StateChange(record, State.ACTIVE)]
 
     def _recall(self, record: Record, reason: Reason, details: str, by: By | None, now: Now) -> list[Effect]:
-        """Remove a goal from the queue, and end it as RECALLED. Return the effects."""
+        """Remove a goal from the queue, and end it as RECALLED."""
         self.pending.remove(record)
         return self._end_unqueued(record, reason, details, by, now)
 
     def _end_unqueued(self, record: Record, reason: Reason, details: str, by: By | None, now: Now) -> list[Effect]:
-        """End a pending goal that isn't in the queue as RECALLED. Return the effects."""
+        """End a pending goal as RECALLED after it has left the queue."""
         record.change_state(State.RECALLING)
         return self._end(record, State.RECALLED, reason, f"not spoken: {details}", by, now)
 
     def _stop(self, record: Record, reason: Reason, by: By | None, now: Now) -> list[Effect]:
-        """Make the active goal PREEMPTING and return the order to stop it, unless it is already being stopped."""
+        """Stop the active goal, unless it is already being stopped."""
         if record.state is State.PREEMPTING:
             return []  # keep the reason for the first stop
         record.change_state(State.PREEMPTING)
@@ -711,7 +711,7 @@ class Scheduler:
         return [StateChange(record, State.PREEMPTING), EngineOrder(record, Order.STOP)]
 
     def _require_active(self, goal_id: str) -> Record:
-        """Return the active goal. Raises IllegalTransition if it doesn't have this id."""
+        """Return the active goal, which must have this id."""
         if self.active is None or self.active.id != goal_id:
             raise IllegalTransition(f"goal {goal_id} is not being spoken")
         return self.active
@@ -737,5 +737,5 @@ class Scheduler:
 
 
 def _expiry_message(record: Record) -> str:
-    """Return a message saying that a goal's time to live was over."""
+    """Return the message for a goal whose time to live is over."""
     return f"its ttl of {options.format_number(record.say.ttl)} s was over"

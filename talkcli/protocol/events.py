@@ -61,7 +61,7 @@ class ServerStatus:
 
     @classmethod
     def from_reply(cls, reply: JsonObject, items: list[JsonObject]) -> ServerStatus:
-        """Read a status from a reply and from the list items that preceded it."""
+        """Read a status from a reply and its list items."""
         lists = {name: [each[name] for each in items if name in each] for name in ("pending", "recent")}
         return cls.from_json({**reply, **lists})
 
@@ -199,7 +199,7 @@ def from_json(message: JsonObject) -> Event | None:
 
 
 def _event_json(kind: str, event: StateChanged | WordHeard | PausedChanged) -> JsonObject:
-    """Return an event's fields for its JSON object, without its goal.
+    """Return the fields of an event's JSON object, except its goal.
 
     The caller converts enums and objects.
     """
@@ -208,7 +208,7 @@ def _event_json(kind: str, event: StateChanged | WordHeard | PausedChanged) -> J
 
 
 def goals(items: list[JsonObject], name: str) -> Iterator[Goal]:
-    """Yield the goals in the field `name` of list items.
+    """Yield the goals in the given field of list items.
 
     Raises Unreadable if a goal is malformed.
     """
@@ -255,7 +255,7 @@ def check_greeting(message: JsonObject) -> None:
 
 
 def item(seq: int | None, **fields: object) -> JsonObject:
-    """Return the message for one item of a list, with these fields.
+    """Return the message for one item of a list.
 
     The items are sent before the reply.
     """
@@ -263,12 +263,12 @@ def item(seq: int | None, **fields: object) -> JsonObject:
 
 
 def ok(seq: int | None, **fields: object) -> JsonObject:
-    """Return the reply to a request that succeeded, with these fields."""
+    """Return the reply to a successful request."""
     return item(seq, ok=True, **fields)
 
 
 def failure(seq: int | None, code: str, message: str) -> JsonObject:
-    """Return the reply to a request that failed, with an error code and a message for the user."""
+    """Return the reply to a failed request."""
     return item(seq, ok=False, error={"code": code, "message": message})
 
 

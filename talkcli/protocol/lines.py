@@ -30,7 +30,7 @@ MAX_DIGITS = 20
 
 
 class TruncatedLine(bytes):
-    """The beginning of a line that is longer than the limit of its `LineSplitter`."""
+    """The beginning of a line that is too long."""
 
     #: length of the complete line in bytes
     size: int
@@ -51,7 +51,7 @@ class LineSplitter:
         self.size = 0
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Add received bytes, and return the lines that are now complete, without their newlines.
+        """Add received bytes, and return the lines that are now complete.
 
         A line that is too long is truncated.
         """
@@ -64,7 +64,7 @@ class LineSplitter:
         return lines
 
     def take_rest(self) -> bytes:
-        """Remove and return the incomplete line, or return b"" if there is none."""
+        """Remove and return the incomplete line."""
         line = bytes(self._rest)
         if self.size > self._max_bytes:
             line = TruncatedLine(line)
@@ -80,7 +80,7 @@ class LineSplitter:
 
 
 def write_request(request: Request) -> JsonObject:
-    """Return a request's JSON object, without the fields that have their default value."""
+    """Return a request's JSON object, without the default values."""
     message: JsonObject = {"request": request.kind}
     for option in request.options:
         value = getattr(request, option.name)

@@ -46,7 +46,7 @@ _COUNT_TYPE = Kind("integer", (int,), "must be an integer", check=_log_count_err
 
 @frozen
 class Hello:
-    """The first message of a client, with its name and whether it will send only urgent requests."""
+    """The first message of a client, which gives its name."""
 
     kind: ClassVar[str] = "hello"
     meaning: ClassVar[str] = "Identify the client. Send this first"
@@ -146,7 +146,7 @@ REQUEST_TYPES: dict[str, type[Request]] = {each.kind: each for each in Request._
 
 
 def read_request(message: JsonObject) -> Request:
-    """Check a request's JSON object, which must not contain `seq`, and return the request.
+    """Check a JSON object, and return the request in it.
 
     Raises:
         BadRequest: the request is malformed.

@@ -58,13 +58,13 @@ class Handler(Protocol):
     greeting: bytes
 
     def joined(self, connection: ClientConnection) -> None:
-        """Identify a new client, and then admit it, keep it waiting, or refuse it."""
+        """Admit a new client, keep it waiting, or refuse it."""
 
     def left(self, connection: ClientConnection) -> None:
         """Remove a client that has disconnected."""
 
     def handle(self, connection: ClientConnection, seq: int | None, request: Request) -> None:
-        """Start to carry out a client's request. The reply may be sent later."""
+        """Start to carry out a client's request."""
 
     def is_waiting(self, connection: ClientConnection) -> bool:
         """Return whether a client is still waiting for a reply or an event."""
@@ -112,7 +112,7 @@ class PendingRequest:
                 timer.cancel()
 
     def resume(self, in_time: bool = True) -> None:
-        """Continue the request if it is waiting. Its call of `wait` returns `in_time`."""
+        """Continue the request if it is waiting."""
         if self._leave():
             self._step(in_time)
 
@@ -128,7 +128,7 @@ class PendingRequest:
         self._steps.close()
 
     def answer(self, items: Iterable[JsonObject] = (), events: Iterable[JsonObject] = (), /, **fields: object) -> None:
-        """Send a successful reply, with list items before it and events after it.
+        """Reply that the request succeeded.
 
         Args:
             items: the lines of a list to send before the reply.
@@ -138,7 +138,7 @@ class PendingRequest:
         self._reply(ok(self.seq, **fields), items, events)
 
     def refuse(self, code: str, message: str, items: Iterable[JsonObject] = ()) -> None:
-        """Send an error reply, with list items before it.
+        """Reply that the request failed.
 
         Args:
             code: the machine-readable error.
@@ -156,12 +156,12 @@ class PendingRequest:
             self.connection.send(reply)
 
     def _step(self, value: bool | None) -> None:
-        """Continue the coroutine with this value until it waits in a list or ends."""
+        """Continue the coroutine until it waits in a list or ends."""
         with contextlib.suppress(StopIteration):  # raised when the coroutine has ended
             self.move_to(self._steps.send(value))
 
     def _leave(self) -> bool:
-        """Remove the request from its waiting list. Return False if it wasn't waiting."""
+        """Remove the request from its waiting list, if it is waiting."""
         if self.waiting_list is None:
             return False
         del self.waiting_list[self]
@@ -254,7 +254,7 @@ class ClientConnection(asyncio.Protocol):
         self._work()
 
     def eof_received(self) -> None:
-        """Record that the client will send nothing more, and close the connection once it has all answers."""
+        """Close the connection once the client has received all answers."""
         self._half_closed = True
         self._work()
 
@@ -314,14 +314,14 @@ class ClientConnection(asyncio.Protocol):
         self.stream.close()
 
     def finish(self) -> None:
-        """Answer the lines that have arrived, send the rest of all lists, and then close the connection."""
+        """Finish all answers, and then close the connection."""
         self._finishing = True
         self._schedule_work()
 
     # -- internals
 
     def _close_after(self, seconds: float, message: str) -> asyncio.TimerHandle:
-        """Start and return a timer that closes the connection with this error message."""
+        """Start a timer that closes the connection with an error message."""
         return self._loop.call_later(seconds, self.close_with, failure(None, "too_slow", message))
 
     def _update_reading(self) -> None:
@@ -367,7 +367,7 @@ class ClientConnection(asyncio.Protocol):
             self._process_line(self._lines.popleft())
 
     def _work(self) -> None:
-        """Send output and process requests, up to a limit for each iteration, and close a finished connection."""
+        """Send output and process requests, up to a limit for each iteration."""
         for _ in range(LINES_PER_TURN):
             if self.stream.closing or self.stream.congested or not self._send_or_process_one():
                 break
@@ -390,7 +390,7 @@ class ClientConnection(asyncio.Protocol):
         self._work()
 
     def _send_or_process_one(self) -> bool:
-        """Send one line or process one request. Return False if there is nothing to do."""
+        """Send one line or process one request, if there is anything to do."""
         if self._outbox:
             first = self._outbox[0]
             if isinstance(first, bytes):

@@ -166,7 +166,7 @@ def is_temporary(error: AddressInUse) -> bool:
 
 @contextlib.contextmanager
 def _raise_in_use(problem: str) -> Iterator[None]:
-    """Turn an OSError in a `with` block into AddressInUse, with `problem` as the start of the message."""
+    """Turn an OSError in a `with` block into AddressInUse."""
     try:
         yield
     except OSError as error:
@@ -244,7 +244,7 @@ def _refuse_live_socket(path: str) -> None:
 
 
 def _prepare_directory(directory: str) -> None:
-    """Create the socket's directory if it doesn't exist, and check that other users can't change it.
+    """Create the socket's directory if necessary, and check that it is safe.
 
     Raises:
         AddressInUse: if the directory can't be created, or if other users could replace the socket in it.
@@ -282,7 +282,7 @@ def _refuse_other_file(path: str) -> None:
 
 
 def _bind(path: str, mode: int) -> socket.socket:
-    """Remove an old socket file, and return a new socket that listens there.
+    """Create a socket at the path, after removing an old socket file.
 
     The caller must hold the lock.
     """
@@ -293,7 +293,7 @@ def _bind(path: str, mode: int) -> socket.socket:
         listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         listening.setblocking(False)
         listening.bind(path)
-        os.chmod(path, mode)  # other users can't connect before `listen`, whatever the mode was
+        os.chmod(path, mode)  # nobody can connect before `listen`
         listening.listen(MAX_BACKLOG_CONNECTIONS)
         return listening
 
@@ -302,7 +302,7 @@ def _bind(path: str, mode: int) -> socket.socket:
 
 
 def _acquire_lock(path: str) -> int:
-    """Lock a socket's path for this server, write the process id, and return the lock file's descriptor.
+    """Lock a socket's path, and return the lock file's descriptor.
 
     The lock lasts until the descriptor is closed.
 
@@ -320,13 +320,13 @@ def _acquire_lock(path: str) -> int:
             break
         os.close(fd)  # the file was removed before it was locked, so try again
     os.ftruncate(fd, 0)
-    with contextlib.suppress(OSError):  # the disk may be full, but nothing depends on this number
+    with contextlib.suppress(OSError):  # the disk may be full, but nothing depends on the process id
         os.write(fd, f"{os.getpid()}\n".encode())
     return fd
 
 
 def _is_lock_of(path: str, fd: int) -> bool:
-    """Return whether the lock file of a path is the file with this descriptor."""
+    """Return whether a descriptor refers to the lock file of a path."""
     status = os.fstat(fd)
     return _identity(f"{path}.lock") == (status.st_dev, status.st_ino)
 
@@ -373,7 +373,7 @@ def _process_exists(pid: int) -> bool:
 
 
 def _read_holder(fd: int) -> int | None:
-    """Wait for the process id in the lock file, and return it, or None if it isn't written in time.
+    """Wait for the process id in the lock file, and return it.
 
     The id of a process that no longer exists was written by an earlier server, and is ignored.
     """

@@ -70,7 +70,7 @@ class Requests:
         speech.on_queue_change = self._schedule_room_check
 
     def handle(self, connection: ClientConnection, seq: int | None, request: Request) -> None:
-        """Start to carry out a client's request. The reply may be sent later."""
+        """Start to carry out a client's request."""
         pending = PendingRequest(connection, seq, request)
         connection.unanswered[pending] = None
         pending.start(self._carry_out(pending))
@@ -86,14 +86,14 @@ class Requests:
         self._speech.subscribers.left(connection)
 
     def shut_down(self) -> None:
-        """End all goals, including those that wait for room in the queue, and reject new ones."""
+        """End all goals, including waiting ones, and reject new ones."""
         notifications = self._cancel_waiting(self._select_waiting(Cancel()), None)
         self._speech.shut_down()
         resume_all(self._speech.waiting_for_voices)
         self._speech.notifications.add(notifications)
 
     async def _carry_out(self, pending: PendingRequest) -> None:
-        """Wait for the list of voices if necessary, carry out a request, and reply with an error if it fails."""
+        """Carry out a request, and reply with an error if it fails."""
         request = pending.request
         try:
             if isinstance(request, Cancel | Pause):
@@ -121,7 +121,7 @@ class Requests:
         return [each for each in connection.unanswered if each.waiting_list is self._speech.waiting_for_voices]
 
     def _must_await_voices(self, pending: PendingRequest) -> bool:
-        """Return whether a request must wait for the list of voices, because it or an earlier request needs it."""
+        """Return whether a request must wait for the list of voices."""
         request = pending.request
         if self._speech.waiting_for_voices and (isinstance(request, Say) or self._awaiting_voices(pending.connection)):
             return True
@@ -129,12 +129,12 @@ class Requests:
         return self._speech.awaits_voices and (names_voice or isinstance(request, Voices))
 
     def _stop_awaiting_voices(self, connection: ClientConnection) -> None:
-        """Continue the requests of a connection without waiting any longer for the list of voices."""
+        """Continue the requests of a connection that wait for the list of voices."""
         for each in self._awaiting_voices(connection):
             each.resume()
 
     def _reserve_memory(self, pending: PendingRequest) -> bool:
-        """Count a waiting request's memory and return True.
+        """Reserve memory for a waiting request.
 
         If too many wait, set its refusal and return False.
         """
@@ -153,13 +153,13 @@ class Requests:
         return False
 
     def _schedule_room_check(self) -> None:
-        """Schedule a check of the goals that wait for room, unless there are none or it is already scheduled."""
+        """Schedule a check of the goals that wait for room, if there are any."""
         if self._speech.waiting_for_room and self._room_check is None:
             # Check in the next iteration of the event loop, because the caller may not have finished its changes.
             self._room_check = asyncio.get_running_loop().call_soon(self._submit_waiting_goals)
 
     def _submit_waiting_goals(self) -> None:
-        """Continue the waiting `say` requests for whose goals the queue now has room."""
+        """Continue waiting `say` requests if the queue now has room."""
         self._room_check = None
         without_room: set[object] = set()
         for each in list(self._speech.waiting_for_room):
@@ -177,7 +177,7 @@ class Requests:
                 each.resume()
 
     def _select_waiting(self, selection: Cancel) -> list[PendingRequest]:
-        """Return the `say` requests that a cancel selects while they wait for room or for the list of voices."""
+        """Return the waiting `say` requests that a cancel selects."""
         waiting = (*self._speech.canceled_goals, *self._speech.waiting_for_room, *self._speech.waiting_for_voices)
         goals = [(each, each.request) for each in waiting if isinstance(each.request, Say)]
         selected = (goals[index][0] for index in selection.select_waiting([say for _, say in goals]))
@@ -185,9 +185,9 @@ class Requests:
         return [each for each in selected if not each.connection.detect_hang_up()]
 
     def _cancel_waiting(self, goals: list[PendingRequest], by: By | None) -> list[Callable[[], None]]:
-        """Mark waiting goals as cancelled, and return functions that submit them to the scheduler.
+        """Mark waiting goals as cancelled.
 
-        The scheduler then recalls them like other goals.
+        Return functions that submit them to the scheduler. The scheduler then recalls them like other goals.
         """
         new = [each for each in goals if each.waiting_list is not self._speech.canceled_goals]
         for each in new:
@@ -280,7 +280,7 @@ class Requests:
         pending.answer(({"goal": each.to_json()} for each in goals), results, count=len(records))
 
     async def _cancel(self, pending: PendingRequest, selection: Cancel) -> None:
-        """Cancel goals, wait until the active one is silent, and reply with the cancelled and the ended goals."""
+        """Cancel goals, and reply when the active one is silent."""
         speech, client = self._speech, pending.connection.client
         now = speech.advance_time()
         waiting = self._select_waiting(selection)
@@ -413,7 +413,7 @@ class Requests:
         pending.answer(settings=options.shown_settings(scheduler.settings))
 
     def _require_goal(self, goal_id: str) -> Record:
-        """Return the goal with this id. Raises UnknownGoal if there is none."""
+        """Return the goal with this id, or raise UnknownGoal."""
         record = self._scheduler.find(goal_id)
         if record is None:
             raise UnknownGoal(_unknown_message(goal_id))
@@ -426,7 +426,7 @@ def _unknown_message(*ids: str) -> str:
 
 
 def _goal_items(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:
-    """Yield a list item for each goal, with the goal in the field `name`.
+    """Yield a list item for each goal.
 
     The goal is copied when the item is sent.
     """
@@ -434,6 +434,6 @@ def _goal_items(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:
 
 
 def _memory_of(value: object) -> int:
-    """Estimate the memory used by a value in bytes, which may be many times the size of its JSON."""
+    """Estimate how many bytes of memory a value uses."""
     inside = value.values() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else ()
     return sys.getsizeof(value) + sum(map(_memory_of, inside))

@@ -130,7 +130,7 @@ class Server:
         self._end_signals = [signal.SIGTERM] if ignored else [signal.SIGTERM, signal.SIGINT]
 
     async def run(self) -> None:
-        """Run the server until it is stopped by a signal or fails, and then close all connections."""
+        """Run the server until a signal or an error stops it."""
         settings, speech = self._settings, self.speech
         descriptors = raise_descriptor_limit(settings.max_clients + MAX_EXTRA_CLIENTS)
         self._acceptor = Acceptor(lambda each: ClientConnection(self, speech.streams, each).begin(), descriptors)
@@ -229,7 +229,7 @@ class Server:
     # -- called by connections
 
     def joined(self, connection: ClientConnection) -> None:
-        """Identify a new client, and then admit it, keep it waiting, or refuse it."""
+        """Admit a new client, keep it waiting, or refuse it."""
         pid, uid = peers.credentials(connection.stream.socket)
         # Other users may connect only if the socket's mode allows it.
         if uid not in {os.getuid(), 0} and not self._listener.mode & 0o066:
@@ -308,7 +308,7 @@ class Server:
             connection.stream.abort()
 
     def _on_signal(self, number: signal.Signals) -> None:
-        """Log the signal and start to shut down. A second signal ends the process immediately."""
+        """Log the signal, and start to shut down."""
         log.write(f"stopping after {signal.Signals(number).name}")
         for each in self._end_signals:
             # A second signal ends the server immediately, without the event loop, which may be busy.

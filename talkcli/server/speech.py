@@ -58,7 +58,7 @@ require_fields(protocol.Speak, ENGINE_OPTIONS)
 
 
 def elapsed() -> float:
-    """Return a monotonic time in seconds, which includes the time that the machine was suspended."""
+    """Return a monotonic time that includes the time spent suspended."""
     return time.clock_gettime(_CLOCK)
 
 
@@ -133,7 +133,7 @@ class Speech:
         return self.voices.listed is None and self.engine_status in {"starting", READY}
 
     def waiting_for_silence(self, record: Record) -> WaitingList:
-        """Return the list of requests that wait until this goal is silent, resumes or ends."""
+        """Return the requests that wait for a goal to become silent or to end."""
         return self._waiting_for_silence.setdefault(record, {})
 
     # -- the scheduler's effects
@@ -146,7 +146,7 @@ class Speech:
         return now
 
     def apply(self, effects: list[Effect]) -> None:
-        """Carry out the scheduler's effects: first the orders to the engine, then the notifications of clients."""
+        """Carry out the scheduler's effects, starting with orders to the engine."""
         changes, queue_changed, at = [], False, time.time()
         for effect in effects:
             if isinstance(effect, StateChange):
@@ -189,7 +189,7 @@ class Speech:
                 log.write(log.sanitize(message))
 
     def _start_speaking(self, record: Record) -> None:
-        """Tell the engine to speak a goal, or report it as failed if a voice that it requires is unavailable."""
+        """Tell the engine to speak a goal, or fail it if its voice is unavailable."""
         self._announced_next = next_waits, next_is_neural = self._describe_next()
         options = engine_options(record.say, self.scheduler.settings)
         if not is_neural(options["voice"] or ""):
@@ -226,7 +226,7 @@ class Speech:
             resume_all(self._waiting_for_silence.pop(record, {}))
 
     def _set_timer(self) -> None:
-        """Schedule `_tick` for the scheduler's next time limit, and cancel the previous timer."""
+        """Set the timer for the scheduler's next time limit."""
         if self._timer:
             self._timer.cancel()
         deadline = self.scheduler.deadline()
@@ -280,7 +280,7 @@ class Speech:
             self._process_engine_event(report, now)
 
     def _process_goal_event(self, event: protocol.GoalEvent, active: Record, now: Now) -> None:
-        """Process the engine's report of a word, the output, the voice, a pause or the end of the active goal."""
+        """Process the engine's report about the active goal."""
         scheduler = self.scheduler
         match event:
             case protocol.Word():
@@ -305,7 +305,7 @@ class Speech:
                     resume_all(self.waiting_for_silence(active))
 
     def _process_voice_event(self, event: protocol.VoiceEvent, now: Now) -> None:
-        """Process the engine's list of voices, or its report of a loaded, measured or unloaded voice."""
+        """Process the engine's report about a voice or its list of voices."""
         scheduler = self.scheduler
         match event:
             case protocol.VoiceList():
@@ -342,7 +342,7 @@ class Speech:
                     self.apply(self.scheduler.failed(active.id, Reason.ENGINE_FAILED, event.message, None, now))
 
     def _end_active_goal(self, ended: protocol.Ended, active: Record, now: Now) -> None:
-        """End the active goal as the engine reports: completed, stopped or failed."""
+        """End the active goal after the engine's report."""
         scheduler = self.scheduler
         if self.ready and ended.player:  # let `status` show the player that was used
             self.ready = replace(self.ready, player=ended.player)
@@ -376,7 +376,7 @@ class Speech:
             self.apply(self.scheduler.engine_unavailable(now))
 
     def _record_engine_failure(self, message: str) -> None:
-        """Record and log why there is no engine, and resume the requests that wait for its list of voices."""
+        """Record and log the reason why there is no engine."""
         if message != self.engine_status:
             log.write(log.sanitize(message))
         self.engine_status = message
@@ -391,7 +391,7 @@ class Speech:
         self.apply(self.scheduler.shutdown(self.advance_time()))
 
     def _finish_if_all_ended(self) -> None:
-        """Set `finished` if the server is shutting down, all goals have ended, and clients have been notified."""
+        """Set `finished` once all goals have ended during a shutdown."""
         if self.scheduler.closing and not (self.scheduler.active or self.canceled_goals):
             self.finished.set()
 
@@ -400,7 +400,7 @@ class Speech:
 
 
 def _log_goal_end(record: Record, seconds: float) -> None:
-    """Log that a goal has ended. `seconds` is how long it was active."""
+    """Log the end of a goal that was active for `seconds`."""
     took = "" if record.started_at is None else f" after {seconds:.1f} s"
     how = f"{record.id} {record.state.name}{took}"
     if record.state is not State.SUCCEEDED:

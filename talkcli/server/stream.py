@@ -52,7 +52,7 @@ _NO_CONNECTION = {errno.EAGAIN, errno.ECONNABORTED, errno.EPROTO, errno.EINTR}
 
 
 class ClientStreams:
-    """The streams of all clients, which send their output together and share a limit for unread output.
+    """The streams of all clients, which share a limit for unread output.
 
     The output is sent at the end of each iteration of the event loop, in one callback for all streams. This saves a
     third of the time if fifty clients watch the words.
@@ -80,7 +80,7 @@ class ClientStreams:
         self._written[stream] = None
 
     def _flush_written(self) -> None:
-        """Send the output of all streams that were written to in this iteration."""
+        """Send the output that was written in this iteration."""
         written, self._written = self._written, {}
         for stream in written:
             try:
@@ -172,7 +172,7 @@ class ClientStream:
         return len(self._unread)
 
     def count_held(self, size_bytes: int) -> None:
-        """Change the size of the output that the receiver holds back by `size_bytes`, and enforce the limit."""
+        """Adjust the size of the output that the receiver holds back."""
         if self in self._streams.open:
             self.held_bytes += size_bytes
             self._streams.unread_bytes += size_bytes
@@ -196,7 +196,7 @@ class ClientStream:
         self._streams.shed_load()
 
     def flush(self) -> None:
-        """Send the output now. If the client has closed its socket, this sets `closing`."""
+        """Send the output now, and set `closing` if the client has closed its socket."""
         if self._unread and not self._blocked:
             self._send()
 
@@ -235,7 +235,7 @@ class ClientStream:
             self._report_congestion()
 
     def _report_congestion(self) -> None:
-        """Tell the receiver to pause or resume writing, depending on the size of the unsent output."""
+        """Tell the receiver to pause or resume writing, if necessary."""
         if not self.congested and len(self._unread) > CONGESTION_BYTES:
             self.congested = True
             self._receiver.pause_writing()

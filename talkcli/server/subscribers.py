@@ -61,7 +61,7 @@ class Subscribers:
         self._alive_timer: asyncio.TimerHandle | None = None
 
     def subscribe_to_goal(self, goal_id: str, connection: ClientConnection, *, feedback: bool = False) -> None:
-        """Subscribe a connection to a goal's states and result, and with `feedback` also to its words."""
+        """Subscribe a connection to a goal's states and result, and optionally its words."""
         waiting = self._waiters.setdefault(goal_id, {})
         waiting[connection] = waiting.get(connection, False) or feedback
         self.schedule_keep_alive()
@@ -131,7 +131,7 @@ class Subscribers:
         return listeners
 
     def _send_alive(self) -> None:
-        """Send a keep-alive message to all clients that are waiting or watching, and schedule the next one."""
+        """Send a keep-alive message to all subscribed clients."""
         self._alive_timer = None
         listeners = dict.fromkeys(chain(self._watchers, self._waiting_for_room(), *self._waiters.values()))
         _publish({"event": "alive"}, listeners)
@@ -140,7 +140,7 @@ class Subscribers:
 
 
 def _publish(event: JsonObject, connections: Iterable[ClientConnection], *, feedback: bool = False) -> None:
-    """Encode an event once, and send it to these connections.
+    """Encode an event once, and send it to several connections.
 
     Feedback may be dropped for slow clients.
     """
@@ -192,7 +192,7 @@ class Notifications:
             await request.wait({})
 
     def _work(self, unread_before: int) -> None:
-        """Call functions from the queue, up to a limit for each iteration, and schedule a call for the rest.
+        """Call functions from the queue, up to a limit for each iteration.
 
         Args:
             unread_before: the size of the unread output before the first call.
@@ -214,7 +214,7 @@ class Notifications:
             self._turn = self._loop.call_soon(self._work, min(unread_before, self._streams.unread_bytes))
 
     def _await_readers(self, unread_before: int, until: float) -> None:
-        """Continue if clients have read the new output or the time `until` has come.
+        """Continue once clients have read the new output, or at the time `until`.
 
         Otherwise, check again soon.
         """

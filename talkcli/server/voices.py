@@ -29,10 +29,11 @@ class VoiceCatalog:
         self.driver: str | None = None
 
     def look_up(self, voice: str | None, settings_voice: str | None = None) -> tuple[str | None, Refusal | None]:
-        """Return the voice that a client asks for, and a refusal if the voice is not available.
+        """Return the voice that a client asks for.
 
-        For a neural voice, the first value is the id. For every other voice, it is the client's input. The default
-        voice is never checked, and other voices are not checked before the engine has listed its voices.
+        If it is not available, also return a refusal. For a neural voice, the first value is the id. For every other
+        voice, it is the client's input. The default voice is never checked, and other voices are not checked before the
+        engine has listed its voices.
 
         Args:
             voice: the client's input.
@@ -80,7 +81,7 @@ class VoiceCatalog:
         return tuple(each for each in self.listed or () if not is_neural(each.id))
 
     def _candidates(self, voice: str) -> tuple[Voice, ...]:
-        """Return the voices to search for this name, including the neural voices that are installed now."""
+        """Return the voices to search for a name."""
         own = () if is_neural(voice) else self._driver_voices
         if self._foreign_driver is not None:
             return own
@@ -97,7 +98,7 @@ class VoiceCatalog:
 
     @staticmethod
     def _missing_part(voice: str) -> str | None:
-        """Return an error message if a neural voice lacks the named speaker or a Python package, or None."""
+        """Return an error message if a neural voice lacks its speaker or a package."""
         model, mark, speaker = voice.partition(SPEAKER_MARK)
         if mark:
             try:

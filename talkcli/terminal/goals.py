@@ -77,13 +77,13 @@ _DESCRIPTOR_PATH = re.compile(r"/dev/(fd/\d+|stdin)|/proc/(self|\d+)/fd/\d+")
 def describe_end(goal: Goal) -> str:
     """Return a one-line description of how a goal ended."""
     words = printable(goal.message or goal.state.name)
-    if goal.by and f"by goal {goal.by.goal}" not in words:  # a server may have named the goal already
+    if goal.by and f"by goal {goal.by.goal}" not in words:  # the message may already name the goal
         words += f" ({_describe_cause(goal.by)})"
     return f"{printable(goal.id)}: {words}" if goal.id else words
 
 
 def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
-    """Return all details of a goal, with one field per line. `now` is a Unix timestamp."""
+    """Return all details of a goal, with one field per line."""
     state = screen.coloured(goal.state.name, goal.state)
     rows = [
         ("id", printable(goal.id)),
@@ -114,7 +114,7 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
 
 
 def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
-    """Return the lines of `talk status`. `now` is a Unix timestamp."""
+    """Return the lines of `talk status`."""
     server = status.server
     screen = replace(screen, boot=str(server.get("boot")))
     uptime = server.get("uptime")
@@ -193,7 +193,7 @@ def _goal_table(label: str, goals: Sequence[Goal], id_columns: int, screen: Scre
 
 
 def _head_columns(goal: Goal, id_columns: int, screen: Screen) -> str:
-    """Return the columns before a goal's text: its end time if it has ended, its id and its state."""
+    """Return the columns before a goal's text, such as its id and state."""
     goal_id = pad(screen.goal_id(goal.id), id_columns)
     head = f"{goal_id}{COLUMN_GAP}{screen.coloured(pad(goal.state.name, 9), goal.state)}{COLUMN_GAP}"
     return f"{clock_time(goal.ended_at)}{COLUMN_GAP}{head}" if goal.state.terminal else head
@@ -210,7 +210,7 @@ def _tail_forms(goal: Goal, screen: Screen, now: float) -> list[str]:
 
 
 def quoted_text(goal: Goal, limit: int | None = None) -> str:
-    """Return a goal's text in quotes, cut to `limit` characters, or a placeholder if it is no longer kept."""
+    """Return a goal's text in quotes, or a placeholder if it is no longer kept."""
     return _quote(goal.text, limit) or TEXT_NOT_KEPT
 
 
@@ -259,7 +259,7 @@ def _describe_sender(sender: Sender | None) -> str:
 
 
 def sender_forms(sender: Sender | None, screen: Screen) -> list[str]:
-    """Return alternative descriptions of a sender, longest first, so that the first one that fits can be shown.
+    """Return alternative descriptions of a sender, longest first.
 
     The command and the process id are only included with `screen.long`. The name that the sender has
     chosen comes first. It is in quotes because it isn't verified.
@@ -312,7 +312,7 @@ def reason_forms(goal: Goal, screen: Screen) -> list[str]:
 
 
 def _message_details(goal: Goal) -> str:
-    """Return the part of a goal's message that adds to its reason, or an empty string."""
+    """Return the part of a goal's message that adds to its reason."""
     if goal.state not in {State.ABORTED, State.REJECTED} and goal.by is not None:
         return ""
     details = message_details(goal.message)
@@ -326,12 +326,12 @@ def _describe_output(output: Output) -> str:
 
 
 def _muted_note(goal: Goal) -> list[str]:
-    """Return `["muted"]` if the goal's output was muted, otherwise an empty list."""
+    """Return a list with a note if the goal's output was muted."""
     return ["muted"] if goal.output and goal.output.muted else []
 
 
 def _sender_command(sender: Sender) -> str:
-    """Return the command line of the sender's parent or, if unknown, the sender's program, cut to 60 characters."""
+    """Return the command line of the sender's parent, or else the sender's program."""
     return printable(sender.parent or sender.command or "a program", _SENDER_COMMAND_CHARS)
 
 
@@ -346,7 +346,7 @@ def _script_name(sender: Sender) -> str:
 
 
 def _launched_command(words: list[str]) -> list[str]:
-    """Return the command line that a launcher such as `bash` or `sudo` runs, or an empty list.
+    """Return the command line that a launcher such as `bash` or `sudo` runs.
 
     The list is empty if the command isn't a launcher, or if the script has no name.
     """
@@ -379,7 +379,7 @@ def _file_name(path: str) -> str:
 
 
 def _format_status_fields(server: JsonObject, *names: str) -> list[str]:
-    """Format fields of the server's status. Optional fields without a value are left out."""
+    """Format fields of the server's status, without empty optional ones."""
     shown = [each for each in names if server.get(each) or each not in _OPTIONAL_FIELDS]
     return [_FIELD_FORMATS.get(each, f"{each} {{}}").format(_format_status_field(server, each)) for each in shown]
 
@@ -392,7 +392,7 @@ def _format_value(value: object) -> str:
 
 
 def clock_time(seconds: float | None) -> str:
-    """Format a timestamp as the local time of day, or as dashes if it is None."""
+    """Format a timestamp as the local time of day, or as dashes if it is unknown."""
     return "--:--:--" if seconds is None else time.strftime("%H:%M:%S", time.localtime(seconds))
 
 
@@ -402,6 +402,6 @@ def _format_date_and_time(seconds: float | None) -> str | None:
 
 
 def _format_status_field(server: JsonObject, name: str) -> str:
-    """Format the value of a field of the server's status, or return "default" if it is None."""
+    """Format the value of a field of the server's status."""
     value = server.get(name)
     return "default" if value is None else printable(_format_value(value), _LISTED_TEXT_CHARS)

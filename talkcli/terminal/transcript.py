@@ -54,7 +54,7 @@ class ColumnWidths:
         self._ids, self._robots = _FIRST_ID_COLUMNS, _FIRST_NAME_COLUMNS
 
     def pad_robot(self, name: str, screen: Screen) -> str:
-        """Pad a robot's name to the width of its column, which is widened if necessary.
+        """Pad a robot's name, and widen its column if necessary.
 
         The name takes up at most a sixth of the terminal.
         """
@@ -63,7 +63,7 @@ class ColumnWidths:
         return pad(shown, self._robots)
 
     def pad_goal_id(self, goal_id: str, screen: Screen) -> str:
-        """Shorten a goal id for display, and pad it to the width of its column, which is widened if necessary."""
+        """Shorten and pad a goal id, and widen its column if necessary."""
         shown = screen.goal_id(goal_id)
         self._ids = max(self._ids, _FIRST_NAME_COLUMNS * screen.long, min(width(shown), _MAX_NAME_COLUMNS))
         return pad(shown, self._ids)
@@ -118,7 +118,7 @@ class Transcript:
         return []  # results aren't shown, and words only on request
 
     def _format_snapshot(self, event: Snapshot, screen: Screen, now: float) -> list[str]:
-        """Remember the server's state, and return a line about the server and the lines of all unfinished goals."""
+        """Remember the server's state, and return the lines that show it."""
         status = event.status
         goals = unfinished(status)
         for goal in goals:
@@ -136,7 +136,7 @@ class Transcript:
         return lines
 
     def _format_state_change(self, event: StateChanged, screen: Screen, now: float) -> list[str]:
-        """Remember or forget a goal after a change of its state, and return the lines that show the change."""
+        """Remember a goal's new state, and return the lines that show it."""
         if event.goal is not None:
             self._goals[event.id] = event.goal
             if len(self._goals) > _MAX_REMEMBERED_GOALS:  # the event for the end of the oldest goal was probably missed
@@ -163,7 +163,7 @@ class Transcript:
         return (head + longest_fitting(forms, screen.columns_left(width(head)))).rstrip()
 
     def _format_goal(self, goal: Goal, state: State, at: float, screen: Screen) -> list[str]:
-        """Return the lines that show a goal with its state, text, and sender or reason.
+        """Return the lines that show a goal.
 
         `at` is a timestamp.
         """
@@ -184,14 +184,14 @@ class Transcript:
         return [fit_row(head, text, forms, columns * 3 // 4, screen)]
 
     def _head_columns(self, at: float, word: str, state: State | None, goal_id: str, screen: Screen) -> str:
-        """Return the first columns of a line: time, robot, a word in the colour of the state, and goal id."""
+        """Return the first columns of a line, up to the goal's id."""
         robot = [] if self._robot is None else [self._widths.pad_robot(self._robot, screen)]
         cells = (screen.coloured(pad(word, 10), state), self._widths.pad_goal_id(goal_id, screen))
         return COLUMN_GAP.join((clock_time(at), *robot, *cells, ""))
 
 
 def log_lines(goals: Sequence[Goal], screen: Screen, now: float) -> list[str]:
-    """Return one line for each ended goal, for `talk log`. `now` is a Unix timestamp."""
+    """Return one line for each ended goal, for `talk log`."""
     if not goals:
         return []
     today = time.localtime(now)[:3]
