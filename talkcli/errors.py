@@ -122,7 +122,7 @@ class Busy(RequestRefused):
 
 
 class BadOption(RequestRefused):
-    """The server refused a setting, because the value is out of range or the voice doesn't exist."""
+    """The server refused the value of a setting."""
 
     code = "bad_option"
     exit_code = EXIT_USAGE

@@ -62,7 +62,7 @@ class _Methods:
     """The methods that `frozen` adds to a class."""
 
     def __init__(self, *arguments: object, **named: object) -> None:
-        """Set the fields of an instance whose class has no compiled `__init__` yet."""
+        """Set the fields of an instance."""
         cls: Any = type(self)
         names = cls.__match_args__
         given = dict(zip(names, arguments, strict=False))

@@ -23,7 +23,7 @@ NEURAL_PACKAGES = ("onnxruntime", "numpy")
 
 @frozen
 class Environment:
-    """The properties of a Python environment that determine how to install packages into it."""
+    """The properties of a Python environment that matter for installing packages."""
 
     python: str  # path to the interpreter
     pipx: str | None = None  # directory of the environment if it was created by pipx

@@ -29,12 +29,12 @@ PLACE_FORBIDDEN = "permission denied"
 
 
 def named_socket(option: str | None) -> str | None:
-    """Return the socket path from the option or from TALK_SOCKET, or None if neither is set."""
+    """Return the socket path from the option or from TALK_SOCKET, if one is set."""
     return option or os.environ.get("TALK_SOCKET") or None
 
 
 def named_robot(option: str | None, socket: str | None) -> str | None:
-    """Return the robot named by --robot or by TALK_ROBOT, or None.
+    """Return the robot named by --robot or by TALK_ROBOT, if any.
 
     TALK_ROBOT is ignored if --socket is given.
 

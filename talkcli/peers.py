@@ -47,7 +47,7 @@ def _decode_integer(data: bytes) -> int:
 
 
 def command_name(pid: int) -> str | None:
-    """Return the name of the program that a process runs, or None if it is unknown."""
+    """Return the name of the program that a process runs."""
     line = read_proc_file(f"/proc/{pid}/comm")
     return line.decode(errors="replace").rstrip("\n") if line else None
 

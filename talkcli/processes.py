@@ -85,7 +85,7 @@ def _read_links(folder: str) -> Iterator[str]:
 
 
 def _list_names(folder: str) -> list[str]:
-    """Return the names of the entries in a directory, or an empty list if it can't be read."""
+    """Return the names of the entries in a directory, if it can be read."""
     try:
         return os.listdir(folder)
     except OSError:  # the directory belongs to another user, or doesn't exist

@@ -227,5 +227,5 @@ def _describe_missing_voice(language: str, voices: Iterable[JsonObject]) -> str:
 
 
 def _language_code(voice: JsonObject) -> str:
-    """Return the language code of a voice in lower case, or an empty string if it has none."""
+    """Return the language code of a voice in lower case."""
     return str(voice.get("language") or "").lower()

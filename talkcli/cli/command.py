@@ -77,7 +77,7 @@ class Command:
     uses_server: bool = True
     #: whether --connect-timeout can be used with the command
     connects: bool = True
-    #: the function that sends the command to several robots, as "module:name", or an empty string
+    #: the function that sends the command to several robots, as "module:name"
     fleet_function: str = ""
     rule: Rule | None = None
     #: the exit codes to show in the help, with their meanings

@@ -1,4 +1,4 @@
-"""The commands `talk serve` and `talk bridge`, which run until they are stopped, and their systemd units.
+"""The commands `talk serve` and `talk bridge`, and their systemd units.
 
 The templates of the units are in the directory `systemd`. For example, `serve-user` is the template for `talk serve
 --print-unit user`. A name in braces is replaced by its value, and a line such as `@supervision.conf` includes that
@@ -176,7 +176,7 @@ def _read_template(name: str) -> str:
 
 
 def _find_program(started_as: str) -> tuple[str, ...]:
-    """Return the command that starts this program: the installed script or `python -m talkcli`."""
+    """Return the command that starts this program."""
     script = os.path.join(os.path.dirname(sys.executable), "talk")
     found = shutil.which(started_as if os.path.basename(started_as) == "talk" else script)
     return (os.path.abspath(found),) if found else (sys.executable, "-m", "talkcli")

@@ -92,12 +92,12 @@ def change(options: CommonOptions, **settings: Any) -> int:
 
 
 def pause(options: CommonOptions) -> int:
-    """Pause speech on each robot, and return the exit code."""
+    """Pause speech on each robot."""
     return _send_request(options, Pause())
 
 
 def resume(options: CommonOptions) -> int:
-    """Resume paused speech on each robot, and return the exit code."""
+    """Resume paused speech on each robot."""
     return _send_request(options, Resume())
 
 

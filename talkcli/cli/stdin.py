@@ -100,7 +100,7 @@ class InputLine:
     """A line of standard input."""
 
     number: int
-    #: the line without its line ending; truncated if the line is too long
+    #: the line without its line ending, cut off if it is too long
     text: str
     #: the size of the line in bytes if it is too long to be spoken, otherwise 0
     oversize_bytes: int = 0
@@ -120,7 +120,7 @@ class LineBuffer:
         self._ttl = ttl
         # Allow one more byte than the longest text has, because a line may end in CRLF.
         self._splitter = LineSplitter(MAX_TEXT_BYTES + 1)
-        #: unsplit chunks of input and the times at which they were read; splitting them late saves memory
+        #: chunks of input with the times at which they were read. Splitting them into lines late saves memory.
         self._chunks: deque[tuple[float, bytes]] = deque()
         self._lines: deque[InputLine] = deque()
         self._number = 0
@@ -217,7 +217,7 @@ class LineSpeaker:
         self._ttl: float | None = goal_options["ttl"] or None
         self._buffer = LineBuffer(self._ttl)
         self._interrupts = Interrupts(output=wait)
-        #: the number of the line that was sent but hasn't been accepted or rejected yet, or None
+        #: the number of the line that is waiting for the server's answer, or None
         self._sending: int | None = None
         #: the goal and its unanswered request, or None
         self._unanswered: tuple[GoalHandle, Exchange] | None = None

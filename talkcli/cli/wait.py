@@ -66,7 +66,7 @@ class GoalReporter:
             self.feedback.note("speech is paused; continue with: talk resume")
 
     def follow(self, goals: Sequence[GoalHandle], timeout: float | None) -> None:
-        """Show the events of these goals until they have ended.
+        """Show the events of goals until they have ended.
 
         Raise TimeoutError if they don't end in time.
 

@@ -206,7 +206,7 @@ class Client:
         return handle
 
     def follow(self, ids: Iterable[str] | None = None, *, feedback: bool = False) -> list[GoalHandle]:
-        """Receive the events of goals that any client has sent, and return their handles.
+        """Receive the events of goals, and return their handles.
 
         Args:
             ids: ids of goals; None for all goals that have not ended.
@@ -236,7 +236,7 @@ class Client:
         before: str | None = None,
         key: str | None = None,
     ) -> Canceled:
-        """Cancel goals, and return them when they are silent.
+        """Cancel goals, and return them once they are silent.
 
         Without arguments, cancel all goals.
 

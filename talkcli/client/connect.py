@@ -100,7 +100,7 @@ def reach(
 
 
 def _check_owner(connected: _socket.socket) -> None:
-    """Raise AccessDenied if the server belongs to another user, who could read all requests."""
+    """Raise AccessDenied if the server belongs to another user."""
     _, uid = peers.credentials(connected)
     if uid not in {os.getuid(), 0}:
         raise AccessDenied(f"belongs to uid {uid}; to use it anyway, add --socket")

@@ -135,7 +135,7 @@ class Connection(ClientCore):
             self.changed.notify_all()
 
     def request(self, request: Request, on_reply: OnReply | None = None) -> tuple[JsonObject, list[JsonObject]]:
-        """Send a request, wait for the reply, and return it with its list items.
+        """Send a request, and return the reply with its list items.
 
         Args:
             request: the request.
@@ -161,7 +161,7 @@ class Connection(ClientCore):
         return self.answer(exchange)
 
     def begin(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> Exchange:
-        """Send a request, and return its exchange without waiting for the answer.
+        """Send a request without waiting for the answer.
 
         The arguments are those of `Exchange`.
         A caller without `on_failure` must call `forget` if it stops waiting for the answer.

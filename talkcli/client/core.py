@@ -101,7 +101,7 @@ class EventBuffer:
 
 
 class EventListeners:
-    """The receivers of a connection's events: followed goals, and readers that watch all goals."""
+    """The receivers of a connection's events."""
 
     def __init__(self) -> None:
         #: the followed goals, by id. A goal can be followed several times.
@@ -144,7 +144,7 @@ class EventListeners:
                 self.watches.discard(buffer)
 
     def publish(self, event: Event | None) -> None:
-        """Pass an event to the goals that it concerns and to the readers that watch all goals.
+        """Pass an event to all its receivers.
 
         Events of an unknown kind are None, and are ignored.
         """
@@ -175,7 +175,7 @@ class TrackedGoal:
         self.attached = False
         #: whether all speech is paused, as far as the client knows
         self.speech_paused = False
-        #: monotonic time at which the server began to send the goal's events to this connection, or None
+        #: monotonic time since which the server has sent the goal's events, or None
         self._followed_at: float | None = None
         #: whether to buffer words and pauses, too
         self._with_feedback = False
@@ -300,7 +300,7 @@ class Exchange:
         """
         self.request = request
         self.on_reply, self.on_failure = on_reply, on_failure
-        #: the `seq` of the request and of its answer, or 0 if the exchange is not registered yet
+        #: the `seq` of the request and its answer, or 0 before registration
         self.number = 0
         #: whether the whole request was sent, so that the server may carry it out
         self.sent = False
@@ -309,7 +309,7 @@ class Exchange:
         self.reply: JsonObject | None = None
         #: the error, if the request failed
         self.error: TalkError | None = None
-        #: monotonic time of the last received line; before the first line, that of the start
+        #: monotonic time at which the exchange last made progress
         self.heard_at = 0.0
 
     @property
@@ -345,7 +345,7 @@ class ClientCore:
         self.listeners = EventListeners()
         #: why the connection has ended for good, or None if it hasn't
         self.ended: str | None = None
-        #: the unanswered exchanges, by number
+        #: the unanswered exchanges, by the `seq` of their requests
         self.exchanges: dict[int, Exchange] = {}
         #: whether the server has sent its greeting, so that requests may be sent
         self.greeted = True
@@ -569,7 +569,7 @@ class ClientCore:
                 self.break_off(f"the server sent a malformed message: {error}", now)
 
     def match(self, message: JsonObject) -> Exchange | None:
-        """Return the exchange to which a message belongs, or None if there is none."""
+        """Return the exchange to which a message belongs, if there is one."""
         number = message.get("seq")
         return self.exchanges.get(number) if isinstance(number, int) else None
 

@@ -149,7 +149,7 @@ class GoalHandle(TrackedGoal):
                 raise failures[0]
 
     def cancel(self) -> Goal:
-        """Cancel the goal, and return it once it has ended and is silent.
+        """Cancel the goal, and return it once it is silent.
 
         Raises:
             UnknownGoal: the server doesn't know the goal, for example because the server was restarted.
@@ -200,7 +200,7 @@ class GoalHandle(TrackedGoal):
         self._connection.request(Wait((self.id,), feedback), accepted)
 
     def _give_up(self, timeout: float | None) -> None:
-        """End the goal as LOST if the connection has ended, or else raise TimeoutError."""
+        """End the goal as LOST if the connection has ended, or raise TimeoutError."""
         if not self._lose_if_disconnected():
             raise TimeoutError(f"goal {self.id} has not ended after {0 if timeout is None else round(timeout, 1):g} s")
 

@@ -1,4 +1,4 @@
-"""The messages of a fleet: presence, status, and robots' descriptions for Home Assistant.
+"""The messages that robots of a fleet publish.
 
 Rules for this file: no I/O. Any client of the broker may have written a received payload, so invalid fields are treated
 as missing.

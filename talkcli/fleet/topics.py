@@ -87,7 +87,7 @@ def parse_request(topic: str) -> tuple[str, str] | None:
 
 
 def checked_reply(response: str, user: str, robot_name: str) -> str | None:
-    """Return the topic for a robot's reply, or None if the client may not use its response topic.
+    """Return the topic for a robot's reply, if the client may use it.
 
     This prevents users from making a robot publish to other users or to another robot's topic.
     """

@@ -173,7 +173,7 @@ class Goal:
 
 
 def read_fields(cls: type, message: object) -> dict[str, Any]:
-    """Read the fields of a class from a JSON object, and return a dict.
+    """Read the fields of a class from a JSON object.
 
     Values of the wrong type are skipped.
     """
@@ -198,7 +198,7 @@ def _reader(kind: type) -> Callable[[object], object]:
 
 
 def read_seconds(value: object) -> float | None:
-    """Return a time in seconds from a message, or None if it isn't a number or is too large."""
+    """Return a time in seconds from a message, or None if it is not valid."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
     return float(value) if number and abs(value) <= _MAX_TIME_S else None  # type: ignore[arg-type]
 

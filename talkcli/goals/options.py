@@ -58,7 +58,7 @@ _MAX_FLOAT = 1.7976931348623157e308
 
 
 def without_speaker(voice: str | None) -> str:
-    """Return the id of a voice without its speaker, or an empty string if the voice is None."""
+    """Return the id of a voice without its speaker."""
     return (voice or "").partition(SPEAKER_MARK)[0]
 
 
@@ -98,12 +98,12 @@ def is_clients_id(goal_id: str) -> bool:
 
 
 def _id_error(value: str) -> str | None:
-    """Return an error message if an id is empty or too long, otherwise None."""
+    """Return an error message if an id is empty or too long."""
     return None if 0 < len(value) <= MAX_ID_CHARS else f"must have 1 to {MAX_ID_CHARS} characters"
 
 
 def _ids_error(value: list[object]) -> str | None:
-    """Return an error message if a list of ids is too long or contains an invalid id, otherwise None."""
+    """Return an error message if a list of ids is too long or contains an invalid id."""
     if len(value) > MAX_IDS:
         return IDS.wrong_type
     errors = (_id_error(each) if isinstance(each, str) else ID.wrong_type for each in value)
@@ -111,7 +111,7 @@ def _ids_error(value: list[object]) -> str | None:
 
 
 def _data_error(value: JsonObject) -> str | None:
-    """Return an error message if a goal's `data` is too large or nested too deeply, otherwise None."""
+    """Return an error message if a goal's `data` is too large or nested too deeply."""
     import json
 
     try:
@@ -206,7 +206,7 @@ class Option:
         return self.special_flags or (f"--{self.name.replace('_', '-')}" if self.help else "")
 
     def type_error(self, value: Any) -> str | None:
-        """Return an error message if a value has the wrong type or format, otherwise None."""
+        """Return an error message if a value has the wrong type or format."""
         if value is None and self.default is None:
             return None
         kind = self.kind
@@ -215,7 +215,7 @@ class Option:
         return kind.check(value) if kind.check else None
 
     def value_error(self, value: Any) -> str | None:
-        """Return an error message if a value of the right type is not allowed, otherwise None."""
+        """Return an error message if a value of the right type is not allowed."""
         if value is None:
             return None
         if self.limits != (None, None) and self.is_out_of_range(value):
@@ -256,21 +256,21 @@ class Option:
 
 
 def _check_priority(value: int) -> str | None:
-    """Return an error message if a priority is out of range, otherwise None."""
+    """Return an error message if a priority is out of range."""
     if -MAX_PRIORITY <= value <= MAX_PRIORITY:
         return None
     return f"the priority must be {-MAX_PRIORITY:,} to {MAX_PRIORITY:,}, got {value}"
 
 
 def check_key(value: str) -> str | None:
-    """Return an error message if a string is not a valid key, otherwise None."""
+    """Return an error message if a string is not a valid key."""
     if 0 < len(value) <= MAX_KEY_CHARS:
         return None
     return f"the key must have 1 to {MAX_KEY_CHARS} characters, got {len(value)}"
 
 
 def _check_own_id(value: str) -> str | None:
-    """Return an error message if clients must not choose this id, otherwise None."""
+    """Return an error message if clients must not choose this id."""
     if is_clients_id(value):
         return None
     return (
@@ -280,12 +280,12 @@ def _check_own_id(value: str) -> str | None:
 
 
 def _check_format(value: str) -> str | None:
-    """Return an error message if the value of the option `format` is not supported, otherwise None."""
+    """Return an error message if the format of a text is not supported."""
     return None if value == "text" else f"the format must be 'text', got {value[:MAX_ID_CHARS]!r}"
 
 
 def _check_voice(value: str) -> str | None:
-    """Return an error message if the name of a voice is empty, otherwise None."""
+    """Return an error message if the name of a voice is empty."""
     return None if value else "the voice must not be empty"
 
 
@@ -625,7 +625,7 @@ INITIAL = Set(**{each.name: each.setting.initial for each in SETTINGS if each.se
 
 
 def bad_option(request: Say | Set) -> str | None:
-    """Return an error message if a request contains a value that is not allowed, otherwise None."""
+    """Return an error message if a request contains a value that is not allowed."""
     if isinstance(request, Say) and request.flush and request.preempt is False:
         return "flush can't be combined with preempt false, because it always interrupts"
     for option in request.options:
@@ -636,7 +636,7 @@ def bad_option(request: Say | Set) -> str | None:
 
 
 def bad_text(text: str, max_chars: int | None = MAX_TEXT_CHARS) -> Refusal | None:
-    """Return the reason why a text can't be spoken, or None if there is no obvious problem.
+    """Return the reason why a text can't be spoken, if there is an obvious one.
 
     Args:
         text: the text.
@@ -675,7 +675,7 @@ def engine_options(say: Say, settings: Set) -> dict[str, Any]:
 
 
 def shown_settings(settings: Set) -> JsonObject:
-    """Return settings for display, with None for the default voice and for an unlimited time to live."""
+    """Return settings for display, with None for the default voice and for no time limit."""
     return _replace_none_values(fields(settings))
 
 

@@ -58,7 +58,7 @@ class Queue:
         return None if key is None else self._by_key.get(key)
 
     def with_text(self, text: str) -> Record | None:
-        """Return the first goal with this text, or None.
+        """Return the first pending goal with this text, if any.
 
         This is slow, because it checks every goal.
         """
@@ -73,7 +73,7 @@ class Queue:
         return list(map(_record_of, self._preempting[bisect_left(self._preempting, (-priority,)) :]))
 
     def displaceable_goal(self) -> Record | None:
-        """Return the newest goal of the lowest priority, or None.
+        """Return the newest goal of the lowest priority, if any.
 
         It is removed first if the queue is full.
         """
@@ -101,7 +101,7 @@ class Queue:
             del self._by_key[record.say.key]
 
     def next_expiry(self) -> float:
-        """Return the monotonic time at which the next goal expires, or inf if no goal can expire."""
+        """Return the monotonic time at which the next goal expires."""
         return self._expiries[0][0] if self._expiries else inf
 
     def expired(self, now: float) -> list[Record]:

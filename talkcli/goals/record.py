@@ -32,7 +32,7 @@ class Record:
     id: str
     #: number of the goal in the order of submission
     number: int
-    #: the client's request; if it has no time to live, the server's default is filled in
+    #: the client's request, with the default time to live filled in
     say: Say
     sender: Sender
     queued_at: float
@@ -42,12 +42,12 @@ class Record:
     #: hash of the text if the text was dropped to free memory, otherwise None
     text_hash: int | None = None
     state: State = State.PENDING
-    #: sort position among the pending goals of the same priority, used only by the queue
+    #: position in the queue among the goals of the same priority
     position: int = 0
     reason: Reason | None = None
     by: By | None = None
     message: str | None = None
-    #: offset in the text up to which the goal has been heard
+    #: how far the goal has been heard, as an offset in its text
     spoken_end: int = 0
     #: whether the goal is paused
     paused: bool = False

@@ -126,9 +126,9 @@ class Scheduler:
         self.active: Record | None = None
         #: whether speech is paused
         self.paused = False
-        #: whether goals can start, or fail at once because there is no engine
+        #: whether goals can start, even if they fail at once without an engine
         self.has_engine = False
-        #: whether `shutdown` was called; if so, new goals are rejected
+        #: whether `shutdown` was called, so that new goals are rejected
         self.closing = False
         #: whether an engine process is running that can load voices
         self._loads_voices = False
@@ -455,7 +455,7 @@ class Scheduler:
     # -- time limits
 
     def deadline(self) -> float:
-        """Return the monotonic time at which `tick` must be called, or inf if there is no time limit."""
+        """Return the monotonic time at which `tick` must be called next."""
         return min(self._active_deadline(), self.pending.next_expiry(), self._next_deadline())
 
     def tick(self, now: Now) -> list[Effect]:
@@ -480,7 +480,7 @@ class Scheduler:
     # -- selecting and accepting goals
 
     def _select(self, selection: Cancel, result: Cancellation, waiting: Collection[str | None]) -> list[Record]:
-        """Return the unfinished goals that a cancel selects, and record the others in `result`."""
+        """Return the unfinished goals that a cancel selects."""
         chosen = self.unfinished() if selection.selects_all else []
         for goal_id in dict.fromkeys(selection.ids or ()):
             record = self.find(goal_id)
@@ -505,7 +505,7 @@ class Scheduler:
         return sorted(unique, key=lambda each: (each is self.active, each.number))
 
     def _find_refusal(self, say: Say, refusal: Refusal | None, same_id: Record | None) -> Refusal | None:
-        """Return the reason why a goal must be rejected, or None.
+        """Return the reason why a goal must be rejected, if there is one.
 
         The state of the queue doesn't matter.
 

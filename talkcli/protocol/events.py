@@ -97,7 +97,7 @@ class StateChanged:
     #: the number of the event. A number is skipped if its event was for another client, or if a word was dropped
     #: because this client reads slowly.
     n: int | None = None
-    #: the whole goal. Only clients that watch all goals receive it, with the goal's first and last state.
+    #: the whole goal, which only clients that watch all goals receive, in a goal's first and last event
     goal: Goal | None = None
 
     def to_json(self) -> JsonObject:
@@ -237,7 +237,7 @@ def busy_greeting(message: str | None = None) -> JsonObject:
 
 
 def check_greeting(message: JsonObject) -> None:
-    """Raise ProtocolMismatch or Busy if a greeting shows that this client can't use the server."""
+    """Raise an error if a greeting shows that this client can't use the server."""
     theirs = message.get("talk")
     if theirs != PROTOCOL or isinstance(theirs, bool):
         server = ascii(message.get("version", "unknown"))

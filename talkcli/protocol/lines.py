@@ -90,7 +90,7 @@ def write_request(request: Request) -> JsonObject:
 
 
 def request_line(message: JsonObject) -> bytes:
-    """Encode an object as a line of JSON, without importing `json` if all values are simple."""
+    """Encode an object as a line of JSON, without importing `json` if possible."""
     try:
         shown = ", ".join(f'"{name}": {_encode_simple(value)}' for name, value in message.items())
         return f"{{{shown}}}\n".encode()
@@ -181,7 +181,7 @@ def _json_function(name: str) -> Callable[[Any], Any]:
 
 
 def _create_object(pairs: list[tuple[str, object]]) -> JsonObject:
-    """Return an object with these keys and values.
+    """Return an object with the given keys and values.
 
     Raises ValueError if a key appears twice.
     """

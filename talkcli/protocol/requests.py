@@ -31,12 +31,12 @@ if TYPE_CHECKING:
 
 
 def _sender_name_error(value: str) -> str | None:
-    """Return an error message if a client's name is empty or too long, otherwise None."""
+    """Return an error message if a client's name is empty or too long."""
     return None if 0 < len(value) <= MAX_SENDER_NAME_CHARS else f"must have 1 to {MAX_SENDER_NAME_CHARS} characters"
 
 
 def _log_count_error(value: int) -> str | None:
-    """Return an error message if the `count` of a `log` request is out of range, otherwise None."""
+    """Return an error message if the `count` of a `log` request is out of range."""
     return None if 0 < value <= MAX_LOG_GOALS else f"must be 1 to {MAX_LOG_GOALS:,}"
 
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 #: A client with more unread output than this is disconnected.
 MAX_CLIENT_OUTPUT_BYTES = 4 * 1024 * 1024
-#: A client is disconnected if more messages than this have to wait while a list is sent to it.
+#: Maximum number of messages that wait while a list is sent to a client. With more, the client is disconnected.
 MAX_HELD_MESSAGES = 10_000
 #: Time limit for a client's first request. Clients send `hello` immediately.
 FIRST_REQUEST_S = 5.0
@@ -82,7 +82,7 @@ class PendingRequest:
         self.connection = connection
         self.seq = seq
         self.request = request
-        #: the list that the request waits in, or None
+        #: the waiting list that contains the request, or None
         self.waiting_list: WaitingList | None = None
         #: memory counted for the request while it waits
         self.kept_bytes = 0
@@ -235,7 +235,7 @@ class ClientConnection(asyncio.Protocol):
     # -- called by the stream
 
     def connection_lost(self, error: Exception | None) -> None:
-        """Process the last requests if the connection broke, and remove the client from the server."""
+        """Remove the client from the server after its connection has ended."""
         self._first_limit.cancel()
         self._cancel_line_limit()
         if error is not None and self.admitted:
@@ -356,7 +356,7 @@ class ClientConnection(asyncio.Protocol):
             self.stream.abort()
 
     def _process_last_requests(self) -> None:
-        """Process the last requests of a client that closed its socket without reading the replies.
+        """Process the last requests of a client that has closed its socket.
 
         The system reports this as a connection error, but the requests can still be read after that.
         """
@@ -379,7 +379,7 @@ class ClientConnection(asyncio.Protocol):
         self._update_reading()
 
     def _schedule_work(self) -> None:
-        """Schedule `_work` for the next iteration of the event loop, unless it is already scheduled."""
+        """Schedule `_work` for the next iteration of the event loop."""
         if not self._work_is_scheduled:
             self._work_is_scheduled = True
             self._loop.call_soon(self._do_scheduled_work)

@@ -174,7 +174,7 @@ def _raise_in_use(problem: str) -> Iterator[None]:
 
 
 def _identity(path: str) -> tuple[int, int] | None:
-    """Return the device and inode numbers of a file, or None if the file can't be accessed."""
+    """Return the device and inode numbers of a file, if it can be accessed."""
     try:
         status = os.lstat(path)
     except OSError:

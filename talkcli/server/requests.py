@@ -165,7 +165,7 @@ class Requests:
         for each in list(self._speech.waiting_for_room):
             say = each.request
             assert isinstance(say, Say)
-            # For a goal without an id, the result depends only on these values, so equal goals are checked once.
+            # If there is no room for a goal without an id, there is none for others with the same values.
             kind = (say.priority, say.key, say.flush, say.preempt) if say.id is None else None
             if kind in without_room:
                 continue
@@ -261,7 +261,7 @@ class Requests:
         return say, pending.refusal or refusal
 
     async def _wait(self, pending: PendingRequest, request: Wait) -> None:
-        """Reply with the requested goals, and subscribe the client to those that haven't ended."""
+        """Reply with goals, and subscribe the client to those that haven't ended."""
         await self._speech.notifications.wait_done(pending)  # send earlier events of a goal before its result
         if request.ids is None:
             records = self._scheduler.unfinished()
@@ -365,7 +365,7 @@ class Requests:
             pending.answer(goal=self._require_goal(request.id).snapshot().to_json())
 
     async def _watch(self, pending: PendingRequest, _: Watch) -> None:
-        """Reply with the state of the server and its goals, and subscribe the client to all events."""
+        """Reply with the state of the server, and subscribe the client to all events."""
         await self._speech.notifications.wait_done(pending)  # send earlier events before the overview
         self._answer_overview(pending)
         self._speech.subscribers.watch(pending.connection)

@@ -73,7 +73,7 @@ class ServerSettings:
 
 
 def serve(settings: ServerSettings) -> int:
-    """Run a server until it receives SIGTERM or SIGINT, and return the exit code.
+    """Run a server until it receives SIGTERM or SIGINT.
 
     Raises:
         AddressInUse: if another server is running, or the socket's directory isn't safe.
@@ -182,7 +182,7 @@ class Server:
             raise self._fatal_error
 
     def _prepare_voice(self) -> str | None:
-        """Return the configured voice if the engine must check it, otherwise None.
+        """Return the configured voice if the engine must check it.
 
         A neural voice is checked here.
 

@@ -58,7 +58,7 @@ require_fields(protocol.Speak, ENGINE_OPTIONS)
 
 
 def elapsed() -> float:
-    """Return a monotonic time that includes the time spent suspended."""
+    """Return a monotonic time that doesn't stop while the machine is suspended."""
     return time.clock_gettime(_CLOCK)
 
 
@@ -111,11 +111,11 @@ class Speech:
         self._reports: deque[Report] = deque()
         #: whether the event loop has been woken to process reports. Waking it for each report would be too slow.
         self._reports_due = False
-        #: what the engine was last told: whether another goal follows, and whether its voice is neural
+        #: what the engine was last told about the next goal: whether there is one, and whether its voice is neural
         self._announced_next = False, False
 
     def status_words(self) -> str:
-        """Return a short status message without the texts of goals, because every user can read it."""
+        """Return a short status message that every user may read."""
         scheduler, ready = self.scheduler, self.ready
         if self.engine_status != READY:
             doing = f"engine: {self.engine_status}"
@@ -139,7 +139,7 @@ class Speech:
     # -- the scheduler's effects
 
     def advance_time(self) -> Now:
-        """Handle all time limits that have been reached, and return the current time."""
+        """Handle all time limits that have been reached."""
         now = Now(elapsed(), time.time())
         if self.scheduler.deadline() <= now.monotonic:
             self.apply(self.scheduler.tick(now))
@@ -204,7 +204,7 @@ class Speech:
         )
 
     def _announce_next(self) -> None:
-        """Tell the engine whether another goal follows the active one, so that it can prepare for it."""
+        """Tell the engine whether another goal follows the active one."""
         active, following = self.scheduler.active, self._describe_next()
         if active and following != self._announced_next:
             self._announced_next = following
@@ -321,7 +321,7 @@ class Speech:
                 self.apply(scheduler.voice_unloaded(event.voice, now))
 
     def _process_engine_event(self, event: Report, now: Now) -> None:
-        """Process a report about the engine itself, for example that it is ready or has died."""
+        """Process a report about the engine itself."""
         match event:
             case protocol.Ready():
                 self._handle_ready(event, now)

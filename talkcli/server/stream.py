@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 #: Maximum number of bytes to read at once, equal to the maximum length of a request.
 _READ_BYTES = 64 * 1024
-#: When this much output has collected, it is sent without waiting for the end of the iteration.
+#: Output of this size is sent without waiting for the end of the iteration.
 _FLUSH_BYTES = 64 * 1024
 #: If a client has more unread output than this, the server drops its feedback and stops reading its requests.
 CONGESTION_BYTES = 256 * 1024
@@ -67,7 +67,7 @@ class ClientStreams:
         self._written: dict[ClientStream, None] = {}
 
     def shed_load(self) -> None:
-        """Disconnect the clients with the most unread output until the total is within the limit."""
+        """Disconnect the clients with the most unread output."""
         while self.unread_bytes > MAX_TOTAL_OUTPUT_BYTES and self.open:
             max(self.open, key=lambda each: each.unsent_bytes + each.held_bytes).abort()
             total = MAX_TOTAL_OUTPUT_BYTES >> 20
@@ -271,7 +271,7 @@ class ClientStream:
 
 
 def raise_descriptor_limit(clients: int) -> int:
-    """Raise the limit of open files to fit this number of clients, or log that it is too low.
+    """Raise the limit of open files to fit this number of clients.
 
     Return the limit.
     """
@@ -353,7 +353,7 @@ class Acceptor:
                 connected.close()
 
     def _turn_away(self, connected: socket.socket) -> None:
-        """Tell a client that the server has too few file descriptors, and close the connection."""
+        """Refuse a connection because the server has too few file descriptors."""
         limit = f"the limit of {self._max_descriptors} open files was reached; raise LimitNOFILE= or ulimit -n"
         log.write_limited("descriptors", f"refused a client: {limit}")
         with connected, contextlib.suppress(OSError):  # the client may have closed the connection

@@ -1,4 +1,4 @@
-"""Sends events and keep-alive messages to clients that wait for a goal or watch all goals.
+"""Sends events and keep-alive messages to subscribed clients.
 
 A cancel may end thousands of goals. Therefore, events are sent no faster than clients read them.
 """

@@ -65,7 +65,7 @@ class VoiceCatalog:
             return 0
 
     def _find(self, voice: str, settings_voice: str | None) -> Voice | None:
-        """Return the voice that matches the client's input, or None.
+        """Return the voice that matches the client's input, if any.
 
         Read directories only if necessary.
         """
@@ -90,7 +90,7 @@ class VoiceCatalog:
 
     @property
     def _foreign_driver(self) -> str | None:
-        """Name of the driver if it is not `talk`'s own, or None.
+        """The name of the driver, unless it is `talk`'s own.
 
         Other drivers have no neural voices.
         """

@@ -203,7 +203,7 @@ def _tail_forms(goal: Goal, screen: Screen, now: float) -> list[str]:
     """Return alternative texts for the last column of a goal's line, longest first."""
     if goal.state.terminal:
         return listed_reason_forms(goal, screen)
-    # The sender is the most important detail. The others are left out, beginning with the last one, if they don't fit.
+    # The sender is the most important detail. If there is no room, the other details are left out, the last one first.
     senders, details = sender_forms(goal.client, screen), _unfinished_details(goal, now)
     kept = range(len(details), -1, -1)
     return [", ".join([f"from {sender}", *details[:count]]) for count in kept for sender in senders]
@@ -336,7 +336,7 @@ def _sender_command(sender: Sender) -> str:
 
 
 def _script_name(sender: Sender) -> str:
-    """Return the name of the sender's script, without its directory, interpreter and arguments."""
+    """Return the name of the sender's script, without its directory."""
     words = (sender.parent or "").split()
     if not words:
         return _sender_command(sender)

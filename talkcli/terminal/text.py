@@ -65,7 +65,7 @@ class Screen:
     colour: bool = False
     #: whether to show whole ids, and the commands and process ids of senders
     long: bool = False
-    #: the server's boot id; goals with this id are shown by their numbers
+    #: the server's boot id. Goals with this prefix are shown by their numbers.
     boot: str = ""
 
     def columns_left(self, taken: int) -> int | None:

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 _FIRST_NAME_COLUMNS = 8
 #: The initial width of the id column, which is enough for a server's first 999 goals.
 _FIRST_ID_COLUMNS = 3
-#: The width up to which the robot and id columns grow.
+#: The maximum width of the robot and id columns.
 _MAX_NAME_COLUMNS = 20
 #: The indentation of continuation lines, which is the width of the time column.
 _INDENT_COLUMNS = 10
@@ -154,7 +154,7 @@ class Transcript:
         return self._format_goal(goal, event.state, at, screen)
 
     def _format_pause(self, event: PausedChanged, screen: Screen, now: float) -> str:
-        """Remember whether speech is paused, and return the line that says so."""
+        """Remember whether speech is paused, and return a line that says so."""
         self._paused = event.paused
         name = "paused" if event.paused else "resumed"
         head = self._head_columns(event.at or now, name, State.PREEMPTING, event.id or "", screen)
