@@ -551,7 +551,7 @@ class Scheduler:
         return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)
 
     def _find_room(self, say: Say) -> list[tuple[Record, Reason]] | None:
-        """Return the goals that a new goal removes from the queue, if it fits."""
+        """Return the goals that a new goal would remove from the queue."""
         replaced = self.pending.with_key(say.key)
         preempted: list[Record] = []
         if say.flush:
