@@ -169,8 +169,8 @@ COMMON_OPTIONS = (
     option(
         "--robot",
         WORD,
-        "Send the command to this robot of a fleet, through the broker TALK_BROKER. A pattern, @GROUP or @all selects "
-        "several robots.  [env var: TALK_ROBOT]",
+        "Send the command to this robot through TALK_BROKER. A pattern, @GROUP or @all selects several robots.  "
+        "[env var: TALK_ROBOT]",
         metavar="NAME",
         completion="robots",
     ),

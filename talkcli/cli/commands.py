@@ -38,16 +38,14 @@ def _say_options() -> Iterator[Option]:
         if each.flags:
             yield replace(each, env="", help=f"{each.help}  [env var with -o: {each.env}]") if each.env else each
         if each.name == "wait":
-            yield _timeout_option(
-                "With --wait, cancel the sentence after SEC seconds, including its time in the queue."
-            )
+            yield _timeout_option("With --wait, cancel the sentence after SEC seconds. The time in the queue counts.")
         elif each.name == "id":
             what = "Set the sender's name, which is shown in the log."
             yield Option("name", WORD, special_flags="--as", metavar="NAME", help=what, env="TALK_NAME")
     yield option("--lines", FLAG, "Speak each line of standard input as it arrives.")
     words = "With --lines, keep at most N lines in the server's queue.  [default: 10]"
     yield option("--ahead", INTEGER, words, limits=(1, MAX_QUEUED_GOALS))
-    words = "Write the speech to a WAV file, or to standard output for '-'. No server is needed."
+    words = "Write the speech to a WAV file. '-' means standard output. No server is needed."
     yield option("-o, --output", OUTPUT_FILE, words, metavar="FILE.wav")
 
 
@@ -100,7 +98,7 @@ _SERVE_OPTIONS = (
     option(
         "--player",
         TEXT,
-        "Choose the player: pulse (the sound server), aplay, pacat, pw-cat, null (no sound, but the usual timing), "
+        "Choose the player. It is pulse (the sound server), aplay, pacat, pw-cat, null (no sound, but usual timing), "
         "file:PATH.wav, or a command that reads 16-bit mono PCM. In a command, {rate} and {device} are replaced by "
         "their values. [default: the first of pulse, aplay, pacat and pw-cat that works]",
         metavar="PLAYER",
@@ -117,8 +115,8 @@ _SERVE_OPTIONS = (
     option(
         "--lead-in",
         INTEGER,
-        "If the output was idle, play MS milliseconds of silence before a sentence, so that HDMI, USB and Bluetooth "
-        "outputs don't swallow the first word.",
+        "Play MS milliseconds of silence if the output was idle. HDMI, USB and Bluetooth outputs then don't swallow "
+        "the first word.",
         default=0,
         limits=(0, goal_options.MAX_LEAD_IN_MS),
         metavar="MS",
@@ -127,7 +125,8 @@ _SERVE_OPTIONS = (
     option(
         "--voice-memory",
         INTEGER,
-        "Unload the least recently used neural voice if all of them together use more than about MB megabytes.",
+        "Let neural voices use about MB megabytes of memory. Above this limit, the least recently used voice is "
+        "unloaded.",
         default=300,
         limits=(0, 100_000),
         metavar="MB",
@@ -157,7 +156,7 @@ def _bridge_fault(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
 
 
 _GOAL_IDS = Option("ids", IDS, metavar=IDS.metavar, completion="goal_ids")
-_LONG = option("-l, --long", FLAG, "Show full ids, and the command and process id of each sender.")
+_LONG = option("-l, --long", FLAG, "Show full ids, and each sender's command and process id.")
 
 #: All commands, in the order in which help lists them. The most important ones for new users come first.
 _ROWS = (

@@ -307,7 +307,7 @@ OPTIONS = (
         "send the goal's states and its result to this connection",
         default=False,
         special_flags="-w, --wait",
-        help="Wait until the goal has ended, and return its result as the exit code.",
+        help="Wait until the goal has ended. The exit code shows the result.",
     ),
     Option(
         "feedback",
@@ -332,8 +332,8 @@ OPTIONS = (
         setting=Setting(
             False,
             meaning="whether goals that were sent without `preempt` interrupt the current goal",
-            set_help="Choose whether new sentences interrupt the current sentence, or wait in the queue.",
-            serve_help="Let new sentences interrupt the current sentence, except with 'talk say --queue'.",
+            set_help="Choose whether new sentences interrupt the current one. Otherwise, they wait in the queue.",
+            serve_help="Let new sentences interrupt the current sentence. 'talk say --queue' always waits.",
             flags="--preempt/--no-preempt",
             words="new goals interrupt",
             none_words="new goals wait",
@@ -391,8 +391,7 @@ OPTIONS = (
         "reject the goal if the same text is waiting, is being spoken, or started less than this many seconds ago. For "
         "a goal with a key, keys are compared instead of texts, and waiting goals are ignored",
         limits=(0, None),
-        help="Skip the sentence if the same text (with --key: any text with this key) was spoken in the last "
-        "SEC seconds.",
+        help="Skip the sentence if it was spoken in the last SEC seconds. With --key, all sentences with it count.",
     ),
     Option(
         "id",
@@ -436,7 +435,7 @@ OPTIONS = (
         setting=Setting(
             None,
             none_value=DEFAULT_VOICE,
-            set_help="Use this voice: an id, name or language from 'talk voices', or 'default' for the default voice.",
+            set_help="Use this voice. It is an id, name or language from 'talk voices', or 'default'.",
             words="voice {}",
             none_words="default voice",
         ),
@@ -448,7 +447,7 @@ OPTIONS = (
         "wait until the voice is loaded, and abort the goal (`voice_failed`) if the voice can't be used, instead of "
         "speaking with espeak",
         default=False,
-        help="Wait until the voice is loaded, and fail instead of speaking with another voice.",
+        help="Fail instead of speaking with another voice. Wait until the voice is loaded.",
         for_engine=True,
     ),
     Option(
@@ -566,7 +565,7 @@ class Cancel:
             FLAG,
             "the goal that is being spoken",
             default=False,
-            help="Cancel only the current sentence, and continue with the next one.",
+            help="Cancel only the current sentence. The next one follows.",
         ),
         Option(
             "before",
@@ -579,7 +578,7 @@ class Cancel:
             "key",
             WORD,
             "the current and the waiting goals with this key",
-            help="Cancel the current sentence and all waiting sentences that have this key.",
+            help="Cancel the current and waiting sentences with this key.",
             completion="unfinished_keys",
         ),
     )

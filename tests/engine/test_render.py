@@ -513,5 +513,5 @@ def test_doctor_reports_hangs_during_and_after_the_start_alike(monkeypatch: pyte
 def test_doctor_reports_a_crash_and_a_sentence_that_takes_too_long() -> None:
     died = SentenceResult(State.ABORTED, "engine_crashed", "it was killed by SIGSEGV")
     assert sentence.speak_by_engine("silent-start crash", EngineOptions(), 1.0, 20.0) == died
-    late = SentenceResult(State.ABORTED, "engine_hung", "it did not end within 0.5 s")
+    late = SentenceResult(State.ABORTED, "engine_hung", "the sentence did not end within 0.5 s")
     assert sentence.speak_by_engine("never-ends", EngineOptions(), 1.0, 0.5) == late

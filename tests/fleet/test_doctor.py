@@ -221,7 +221,7 @@ def test_no_check_follows_an_untrusted_certificate(secure_broker: Broker, broker
     results = doctor(secure_broker, user="olga", env={"TALK_MQTT_CA": stranger().file})
     assert list(results) == ["broker", "certificate"]
     assert "unable to get local issuer certificate" in results["certificate"]["message"]
-    assert "another file, of the CA" in results["certificate"]["next"]
+    assert "another file with the certificate of the CA" in results["certificate"]["next"]
     with Broker(expired=True) as expired:
         results = doctor(expired)
     assert "certificate has expired" in results["certificate"]["message"]
