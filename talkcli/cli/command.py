@@ -189,7 +189,7 @@ COMMON_OPTIONS = (
 
 
 def long_flag(option: Option, value: object = None) -> str:
-    """Return the long flag that sets an option to a value, such as --preempt."""
+    """Return an option's long flag, such as --preempt, or its negative one if the value is False."""
     forms = option.flags.split("/")
     return (forms[-1] if value is False else forms[0]).split(", ")[-1]
 

@@ -139,7 +139,7 @@ class Speech:
     # -- the scheduler's effects
 
     def advance_time(self) -> Now:
-        """Handle all time limits that have been reached."""
+        """Handle all time limits that have been reached, and return the current time."""
         now = Now(elapsed(), time.time())
         if self.scheduler.deadline() <= now.monotonic:
             self.apply(self.scheduler.tick(now))

@@ -136,7 +136,7 @@ class Transcript:
         return lines
 
     def _format_state_change(self, event: StateChanged, screen: Screen, now: float) -> list[str]:
-        """Remember a goal's new state, and return the lines that show it."""
+        """Return the lines that show a goal's new state, and remember the goal until it ends."""
         if event.goal is not None:
             self._goals[event.id] = event.goal
             if len(self._goals) > _MAX_REMEMBERED_GOALS:  # the event for the end of the oldest goal was probably missed

@@ -320,7 +320,7 @@ class FleetWatch:
             self._events.append(EventsMissed(RobotInfo(presence, status), tuple(missed)))
 
     def _report(self, robot_event: RobotEvent) -> None:
-        """Report an event of a robot if the robot is selected, and remember which goal it was about."""
+        """Report an event of a selected robot, and remember goals that start or end to detect missed events."""
         name, event = robot_event.name, robot_event.event
         if self._selection and name not in self._presences:
             return

@@ -171,7 +171,7 @@ class Piper:
         return model
 
     def _write_sound(self, parts: Iterator[SpokenPart], rate: int, run: ModelRun, sink: SampleSink) -> None:
-        """Synthesize parts of a text in a background thread, and write them to the sink."""
+        """Write the sound of a text to the sink, while a background thread synthesizes the following parts."""
         write_bytes = int(_WRITE_S * rate) * SAMPLE_BYTES
         seconds = 0.0
         spoken_parts = BackgroundIterator(parts, _MAX_PARTS_AHEAD)
