@@ -1,4 +1,4 @@
-"""The exceptions that `talk` raises, each with an error code and an exit code.
+"""The exceptions that `talk` raises.
 
 Rules for this file:
 
@@ -15,13 +15,16 @@ EXIT_ERROR = 1
 EXIT_USAGE = 2
 EXIT_DIFFER = 13
 EXIT_TIMEOUT = 124  # the same exit code as timeout(1)
-EXIT_SIGNAL = 128  # the signal's number is added, as in a shell
+EXIT_SIGNAL = 128  # add the signal's number, as a shell does
 EXIT_SIGINT = EXIT_SIGNAL + 2
 EXIT_SIGPIPE = EXIT_SIGNAL + 13  # used if standard output is closed
 
 
 class TalkError(Exception):
-    """Base class for all errors. `code` is machine-readable, and `message` is human-readable."""
+    """Base class for all errors.
+
+    `code` is machine-readable, and `message` is human-readable.
+    """
 
     code = "error"
     exit_code = EXIT_ERROR
@@ -47,7 +50,7 @@ class ServerUnavailable(TalkError):
 
 
 class AccessDenied(TalkError):
-    """The user may not use this server, or must not trust the process that listens on its socket."""
+    """The user may not use the server, or can't trust the process behind its socket."""
 
     code = "permission_denied"
     exit_code = 10
@@ -68,7 +71,7 @@ class TimedOut(TalkError):
 
 
 class AddressInUse(TalkError):
-    """`talk serve` can't use the socket, because another server is using it or its directory is not safe."""
+    """The server's socket is used by another server, or its directory is not safe."""
 
     code = "address_in_use"
     exit_code = 11
@@ -119,7 +122,7 @@ class Busy(RequestRefused):
 
 
 class BadOption(RequestRefused):
-    """The server refused a setting, because the value is out of range or the voice doesn't exist."""
+    """The server refused the value of a setting."""
 
     code = "bad_option"
     exit_code = EXIT_USAGE
@@ -145,12 +148,12 @@ _ERRORS_BY_CODE: dict[str, type[RequestRefused]] = {
 
 
 def refusal(code: str, message: str, items: list[dict[str, object]] | None = None) -> RequestRefused:
-    """Return the exception for the error code in a server's reply, which is a RequestRefused or a subclass."""
+    """Return the exception for an error code from the server."""
     return _ERRORS_BY_CODE.get(code, RequestRefused)(message, code, items)
 
 
 def memory_limits() -> str:
-    """Return a text that names the memory limit of this process, or says what to check if there is none."""
+    """Return advice about the memory limit of this process."""
     import resource  # rarely needed, and slow to import
 
     # Each memory limit, its unit, and the shell command and systemd option that change it.

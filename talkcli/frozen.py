@@ -31,7 +31,7 @@ _COMPILE_AFTER_COUNT = 100
 
 @dataclass_transform(frozen_default=True)
 def frozen(cls: type[_T]) -> type[_T]:
-    """Turn a class into an immutable value class, which is compared, hashed and printed by its fields."""
+    """Turn a class into an immutable value class."""
     # Annotations are strings, because every module has `from __future__ import annotations`.
     names = tuple(name for name, kind in cls.__annotations__.items() if not kind.startswith("ClassVar"))
     own = {name: each for name, each in cls.__dict__.items() if name not in {*names, "__dict__", "__weakref__"}}
@@ -62,7 +62,7 @@ class _Methods:
     """The methods that `frozen` adds to a class."""
 
     def __init__(self, *arguments: object, **named: object) -> None:
-        """Set the fields of an instance whose class has no compiled `__init__` yet."""
+        """Set the fields of an instance."""
         cls: Any = type(self)
         names = cls.__match_args__
         given = dict(zip(names, arguments, strict=False))
@@ -102,7 +102,10 @@ _METHODS = {name: each for name, each in vars(_Methods).items() if callable(each
 
 
 def _compile_init(cls: Any) -> Any:
-    """Compile and return an `__init__` for a class. It is five times as fast as the generic one."""
+    """Compile and return an `__init__` for a class.
+
+    It is five times as fast as the generic one.
+    """
     takes = [f"{each}=_defaults[{each!r}]" if each in cls._defaults else each for each in cls.__match_args__]
     # `__setattr__` always raises an error, so the compiled function calls the slots' setters directly.
     sets = [f"    _{each}_(self, {each})" for each in cls.__match_args__] or ["    pass"]

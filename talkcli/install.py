@@ -23,10 +23,10 @@ NEURAL_PACKAGES = ("onnxruntime", "numpy")
 
 @frozen
 class Environment:
-    """The properties of a Python environment that determine how to install packages into it."""
+    """The properties of a Python environment that matter for installing packages."""
 
     python: str  # path to the interpreter
-    pipx: str | None = None  # directory of the environment, if pipx made it
+    pipx: str | None = None  # directory of the environment if it was created by pipx
     user_home: str = ""
     has_pip: bool = True
     made_by_uv: bool = False
@@ -45,7 +45,7 @@ def command(*packages: str, reinstall: bool = False) -> str:
 
 
 def neural(*more: str, reinstall: bool = False) -> str:
-    """Return the shell command that installs the packages for neural voices, or advice on a 32-bit system.
+    """Return the shell command that installs the packages for neural voices.
 
     On a 32-bit system, return advice to use an espeak voice instead.
     """
@@ -55,7 +55,7 @@ def neural(*more: str, reinstall: bool = False) -> str:
 
 
 def espeak_library() -> str:
-    """Return the shell command that installs libespeak-ng, or two alternative commands joined by "or"."""
+    """Return the shell command or commands that install libespeak-ng."""
     package = "sudo apt-get install -y libespeak-ng1"
     return f"{package}, or {command('espeakng-loader')}" if IS_64_BIT else package
 

@@ -29,12 +29,14 @@ PLACE_FORBIDDEN = "permission denied"
 
 
 def named_socket(option: str | None) -> str | None:
-    """Return the socket path from the option or from TALK_SOCKET, or None if neither is set."""
+    """Return the socket path from the option or from TALK_SOCKET, if one is set."""
     return option or os.environ.get("TALK_SOCKET") or None
 
 
 def named_robot(option: str | None, socket: str | None) -> str | None:
-    """Return the value of --robot, or of TALK_ROBOT if --socket isn't given either, or None if there is none.
+    """Return the robot named by --robot or by TALK_ROBOT, if any.
+
+    TALK_ROBOT is ignored if --socket is given.
 
     Both options take precedence over the variables, and TALK_ROBOT over TALK_SOCKET.
     """
@@ -42,7 +44,10 @@ def named_robot(option: str | None, socket: str | None) -> str | None:
 
 
 def client_sockets(named: str | None) -> list[str]:
-    """Return the socket paths for a client to try, in order: only `named` if it is given, or the usual ones."""
+    """Return the socket paths that a client tries, in order.
+
+    If `named` is given, it is the only one.
+    """
     if named:
         return [named]
     directories = [os.environ.get("XDG_RUNTIME_DIR"), *_runtime_directories(os.getuid())]
@@ -51,7 +56,7 @@ def client_sockets(named: str | None) -> list[str]:
 
 
 def describe_place(path: str, error: OSError) -> str:
-    """Return why connecting to this path failed, as one of the PLACE texts or the system's error message."""
+    """Return the reason why connecting to a socket path failed."""
     try:
         mode = os.stat(path).st_mode
     except OSError:  # `error` gives the reason, unless the file has just been removed
@@ -83,13 +88,13 @@ def _runtime_directories(uid: int) -> list[str]:
 
 
 def sudo_caller(environment: Mapping[str, str]) -> int | None:
-    """Return the user id of the user who called sudo, or None if this process isn't root under sudo."""
+    """Return the id of the user who ran sudo, or None outside sudo."""
     caller = environment.get("SUDO_UID", "")
     return int(caller) if os.getuid() == 0 and caller.isdecimal() else None
 
 
 def sudo_caller_socket() -> str | None:
-    """Return the socket path of the user who called sudo, or None if they have no socket or didn't call sudo."""
+    """Return the socket path of the user who ran sudo, if there is one."""
     caller = sudo_caller(os.environ)
     if caller is None:
         return None
@@ -105,7 +110,9 @@ def sudo_caller_socket() -> str | None:
 
 
 def server_socket(named: str | None) -> str:
-    """Return the path for a server's socket. For the default path, also create the directory.
+    """Return the path for a server's socket.
+
+    For the default path, also create the directory.
 
     Raises:
         AddressInUse: the directory is missing or not safe.
@@ -156,10 +163,10 @@ def cache_directory() -> str:
     """Return the path of the cache directory, which may not exist yet."""
     given = os.environ.get("CACHE_DIRECTORY")
     if given:
-        return os.path.realpath(given.split(":")[0])  # a symbolic link, if the unit has DynamicUser=
+        return os.path.realpath(given.split(":")[0])  # this is a symbolic link if the unit sets DynamicUser=
     return os.path.join(_user_directory(os.environ.get("XDG_CACHE_HOME"), "~/.cache"), "talk")
 
 
 def _user_directory(named: str | None, default: str) -> str:
-    """Return the given directory if it is an absolute path, or else the default with `~` expanded."""
+    """Return a directory if its path is absolute, or else the default."""
     return named if named and os.path.isabs(named) else os.path.expanduser(default)

@@ -47,13 +47,13 @@ def _decode_integer(data: bytes) -> int:
 
 
 def command_name(pid: int) -> str | None:
-    """Return the name of the program that a process runs, or None if it is unknown."""
+    """Return the name of the program that a process runs."""
     line = read_proc_file(f"/proc/{pid}/comm")
     return line.decode(errors="replace").rstrip("\n") if line else None
 
 
 def ancestors(pid: int) -> Iterator[int]:
-    """Yield the process ids of a process's parent, grandparent and so on, at most eight of them."""
+    """Yield the process ids of a process's nearest ancestors."""
     for _ in range(_MAX_ANCESTORS_COUNT):
         stat = process_stat(pid)
         pid = int(stat[1]) if stat else 0
@@ -63,10 +63,10 @@ def ancestors(pid: int) -> Iterator[int]:
 
 
 def parent_command_line(pid: int) -> str | None:
-    """Return the start of the command line of a process's parent, skipping wrappers, or None if it is unknown.
+    """Return the start of the command line of a process's parent.
 
-    Wrappers are programs that run another program. Of `timeout 5 talk say …`, the result is the script that called
-    `timeout`.
+    Wrappers are skipped. Wrappers are programs that run another program. Of `timeout 5 talk say …`, the result is the
+    script that called `timeout`.
     """
     line = None
     for parent in ancestors(pid):
@@ -81,7 +81,7 @@ def parent_command_line(pid: int) -> str | None:
 
 
 def process_stat(pid: int) -> list[bytes]:
-    """Return the fields of /proc/PID/stat from the state onwards, or an empty list if it can't be read."""
+    """Return the fields of /proc/PID/stat, starting with the state."""
     stat = read_proc_file(f"/proc/{pid}/stat") or b""
     # The program's name comes before the state, in brackets. The name itself can contain spaces and brackets.
     return stat.rpartition(b")")[2].split()

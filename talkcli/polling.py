@@ -1,4 +1,7 @@
-"""Wait for file descriptors, with a time limit. Other descriptors can interrupt the wait."""
+"""Wait for file descriptors, with a time limit.
+
+Other descriptors can interrupt the wait.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 
-#: A time that never comes, for a wait without a time limit.
+#: The deadline of a wait without a time limit.
 NEVER = float("inf")
 
 
@@ -19,7 +22,9 @@ class Interrupted(Exception):
 def wait_ready(
     watched: Mapping[int, int], timeout: float | None, interrupt: Mapping[int, int] | None = None
 ) -> set[int]:
-    """Wait for descriptors, and return the ready ones, if any. Raise Interrupted if one of `interrupt` is ready.
+    """Wait until descriptors are ready, and return them.
+
+    Raise Interrupted if one of `interrupt` is ready.
 
     Args:
         watched: the poll events to wait for, by descriptor. Errors and hang-ups always count.

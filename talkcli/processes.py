@@ -1,4 +1,4 @@
-"""Pipes that show whether processes are still running, and functions to kill those processes."""
+"""Functions that find and kill running processes with the help of pipes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ _RELEASE_S = 0.01
 
 
 def open_pipes(count: int) -> list[tuple[int, int]]:
-    """Open pipes, and return the reading and writing end of each. If one can't be opened, none is left open."""
+    """Open pipes, and return both ends of each.
+
+    If one can't be opened, none is left open.
+    """
     with contextlib.ExitStack() as opened:
         pipes = []
         for _ in range(count):
@@ -36,17 +39,17 @@ def close(*descriptors: int) -> None:
 
 
 def is_held(pipe: int, seconds: float = 0.0) -> bool:
-    """Wait up to `seconds` for the other end of the pipe to close, and return whether it is still open."""
+    """Return whether the other end of a pipe stays open for `seconds`."""
     # Don't use `wait_ready` here. A player may be killed while the interpreter exits, when modules can't be imported.
     poll = select.poll()
-    poll.register(pipe, 0)  # Linux always reports a closed end
+    poll.register(pipe, 0)  # Linux reports that the other end was closed even if no events are requested
     return not poll.poll(seconds * 1000)
 
 
 def kill_holders(pipe: int) -> bool:
-    """Kill all other processes that hold the pipe open, and return whether any was killed.
+    """Kill all other processes that hold a pipe open.
 
-    Another user's process can't be killed, and without /proc no process can be found.
+    Return whether any was killed. Another user's process can't be killed, and without /proc no process can be found.
     """
     if not is_held(pipe, _RELEASE_S):
         return False
@@ -57,7 +60,10 @@ def kill_holders(pipe: int) -> bool:
 
 
 def kill(pids: Iterable[int]) -> bool:
-    """Kill the processes, and return whether any was killed. A negative id means a process group."""
+    """Kill the processes, and return whether any was killed.
+
+    A negative id means a process group.
+    """
     killed = False
     for pid in pids:
         with contextlib.suppress(ProcessLookupError, PermissionError):
@@ -79,7 +85,7 @@ def _read_links(folder: str) -> Iterator[str]:
 
 
 def _list_names(folder: str) -> list[str]:
-    """Return the names of the entries in a directory, or an empty list if it can't be read."""
+    """Return the names of the entries in a directory, if it can be read."""
     try:
         return os.listdir(folder)
     except OSError:  # the directory belongs to another user, or doesn't exist

@@ -1,4 +1,4 @@
-"""The commands that ask the server: `talk status`, `talk set` and `talk cancel`, as people and scripts see them."""
+"""The output of `talk status`, `talk set` and `talk cancel` for people and scripts."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ DEFAULTS = {"rate": "200", "volume": "1", "voice": "default", "pitch": "50", "pr
 
 @pytest.fixture
 def busy(scripted: Talk) -> Talk:
-    """A server with goals that have ended, one that is being spoken and two that wait."""
+    """A server with two ended goals, an active one and two pending ones."""
     scripted.run("say", "--wait", "length=0")
     scripted.run("say", "--wait", "--", f"fail=audio_lost {LONG}")
     active = scripted.run("say", "--", f"never-ends {LONG}").id
@@ -42,13 +42,13 @@ def test_status_shows_the_settings_and_the_details_of_each_goal(busy: Talk) -> N
     done = busy.run("status")
     lines = done.out.splitlines()
     assert (done.code, done.err) == (0, "")
-    assert [each[:9].rstrip() for each in lines] == ["server", "engine", "settings", "now", "queue", "", "said", ""]
+    assert [line[:9].rstrip() for line in lines] == ["server", "engine", "settings", "now", "queue", "", "said", ""]
     assert re.match(r'now      \d+ +ACTIVE     "never-ends please .*"  from \S.*, for \d+\.\d s$', lines[3])
     assert re.search(r'"battery low" +from \S.*, priority 7, key "battery, low", (1 min )?\d+ s left$', lines[4])
     assert re.search(r'door:open +PENDING    "the door is open"  from "patrol"$', lines[5])
     assert "SUCCEEDED" in lines[6]
     assert lines[7].endswith("audio_lost: scripted audio_lost")
-    assert LONG in lines[7]  # in a pipe no text is cut that has fewer than 200 characters
+    assert LONG in lines[7]  # a pipe gets up to 200 characters of each text
     long = busy.run("status", "-l").out.splitlines()
     assert re.match(r"now      \w{4}-\d+ +ACTIVE ", long[3])
     assert re.search(r'"the door is open" +from "patrol" \(\S.*, pid \d+\)$', long[5])
@@ -60,24 +60,24 @@ def test_status_fits_the_terminal(busy: Talk, columns: int) -> None:
         assert shown.finish() == 0
         lines = shown.lines
     assert max(map(width, lines)) <= columns
-    words = " ".join(" ".join(lines).split())
-    for each in (f"pid {busy.pid} on {busy.socket}", "256 clients", "driver scripted", "voice default", "audio_l"):
-        assert each in words
-    assert 'from "patrol"' in words
-    assert columns < 120 or "priority" in words  # details that do not fit are left out
-    goals = [each for each in lines if "PENDING" in each]
+    text = " ".join(" ".join(lines).split())
+    for part in (f"pid {busy.pid} on {busy.socket}", "256 clients", "driver scripted", "voice default", "audio_l"):
+        assert part in text
+    assert 'from "patrol"' in text
+    assert columns < 120 or "priority" in text  # only details that fit are shown
+    goals = [line for line in lines if "PENDING" in line]
     assert goals[0].index('"') == goals[1].index('"')
     assert b"\x1b[1;32mACTIVE" in shown.raw
 
 
 def test_status_of_one_goal_shows_all_its_details(busy: Talk) -> None:
     pending = json.loads(busy.run("--json", "status").out)["pending"][0]
-    lines = dict(each.split(None, 1) for each in busy.run("status", pending["id"]).out.splitlines())
+    lines = dict(line.split(None, 1) for line in busy.run("status", pending["id"]).out.splitlines())
     assert lines["state"] == "PENDING"
     assert (lines["priority"], lines["key"], lines["text"]) == ("7", '"battery, low"', '"battery low"')
     assert re.fullmatch(r"90 s, (1 min \d+ s|\d+\.\d s) left", lines["ttl"])
     busy.request("say", text="with data", id="d", data={"room": "d'été\x1b"})
-    lines = dict(each.split(None, 1) for each in busy.run("status", "d").out.splitlines())
+    lines = dict(line.split(None, 1) for line in busy.run("status", "d").out.splitlines())
     assert lines["data"] == r'{"room": "d' + "'" + r'été\\u001b"}'
     assert lines["priority"] == "0"
     assert not {"key", "ttl", "started", "reason"} & lines.keys()
@@ -87,8 +87,8 @@ def test_status_of_one_goal_shows_all_its_details(busy: Talk) -> None:
 
 def test_keys_are_escaped_and_long_texts_are_cut_at_200_characters(busy: Talk) -> None:
     goal_id = busy.request("say", text="x" * 300, key="a\x1b[31m\n\u202eb")["goal"]["id"]
-    for words in (["status"], ["status", goal_id]):
-        shown = busy.run(*words).out
+    for command in (["status"], ["status", goal_id]):
+        shown = busy.run(*command).out
         assert r'"a\x1b[31m\n\u202eb"' in shown
         assert "\x1b" not in shown
     assert f'"{"x" * 200}…"' in busy.run("status").out
@@ -99,7 +99,7 @@ def test_ids_of_maximum_length_leave_room_for_the_text(scripted: Talk) -> None:
     for command in ("status", "log"):
         with Terminal([*TALK, command], {"TERM": "xterm", **scripted.env}, 80) as shown:
             shown.finish()
-            line = next(each for each in shown.lines if "SUCCEEDED" in each)
+            line = next(line for line in shown.lines if "SUCCEEDED" in line)
         assert width(line) <= 80
         assert '"length=0"' in line
         assert "i" * 64 in scripted.run(command).out
@@ -113,10 +113,10 @@ def test_status_of_one_goal_wraps_its_whole_text_to_the_terminal(scripted: Talk,
         assert shown.finish() == 0
         lines = shown.lines
     assert max(map(width, lines)) <= columns
-    first = next(number for number, each in enumerate(lines) if each.startswith("text "))
-    more = [each for each in lines[first + 1 :] if each.startswith(" ")]
-    assert {each[:9] for each in more} == {" " * 9}
-    assert f'"{text}"' in " ".join(each[9:].rstrip() for each in lines)
+    first = next(number for number, line in enumerate(lines) if line.startswith("text "))
+    more = [line for line in lines[first + 1 :] if line.startswith(" ")]
+    assert {line[:9] for line in more} == {" " * 9}
+    assert f'"{text}"' in " ".join(line[9:].rstrip() for line in lines)
     assert f'text     "{text}"' in scripted.run("status", "long").out.splitlines()
 
 
@@ -125,25 +125,25 @@ def test_status_of_one_goal_wraps_its_whole_text_to_the_terminal(scripted: Talk,
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[Talk]:
-    """A server for all tests that change only settings, which `shared` restores."""
+    """A server for all tests that change only settings. `shared` restores the settings."""
     with contextlib.closing(Talk(scripted=True)) as talk:
-        assert talk.run("voices").code == 0  # now they are known
+        assert talk.run("voices").code == 0  # now the server knows its voices
         yield talk
         talk.stop()
 
 
 @pytest.fixture
 def shared(server: Talk) -> Talk:
-    """The same server, with the settings of the start."""
+    """The same server, with its initial settings."""
     assert server.request("set", rate=200, volume=1.0, voice="default", pitch=50, preempt=False, ttl=0)["ok"]
     return server
 
 
 def settings(talk: Talk) -> dict[str, str]:
-    """Return the settings that `talk set` prints."""
+    """Return the settings as `talk set` prints them."""
     done = talk.run("set")
     assert (done.code, done.err) == (0, "")
-    return dict(each.split() for each in done.out.splitlines())
+    return dict(line.split() for line in done.out.splitlines())
 
 
 def test_set_without_options_prints_the_settings(shared: Talk) -> None:
@@ -158,7 +158,7 @@ def test_set_without_options_prints_the_settings(shared: Talk) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "name", "value", "shown"),
+    ("options", "name", "value", "shown"),
     [
         (["--rate", "80"], "rate", 80, "80"),
         (["--volume", "0.25"], "volume", 0.25, "0.25"),
@@ -172,29 +172,27 @@ def test_set_without_options_prints_the_settings(shared: Talk) -> None:
         (["--ttl", "0"], "ttl", None, "0"),
     ],
 )
-def test_set_changes_only_the_given_setting(
-    shared: Talk, words: list[str], name: str, value: object, shown: str
-) -> None:
-    changed = json.loads(shared.run("--json", "set", *words).out)
+def test_set_changes_only_this_setting(shared: Talk, options: list[str], name: str, value: object, shown: str) -> None:
+    changed = json.loads(shared.run("--json", "set", *options).out)
     assert changed[name] == value
     assert settings(shared) == {**DEFAULTS, name: shown}
     described = shared.request("status")["server"]
-    assert {each: described[each] for each in changed} == changed
+    assert {setting: described[setting] for setting in changed} == changed
 
 
 def test_the_printed_settings_can_be_used_as_options(shared: Talk) -> None:
     shared.run("set", "--rate", "150", "--volume", str(0.1 + 0.2), "--ttl", "1.5", "--pitch", "60", "--voice", "en")
     assert "volume 0.3, " in shared.log
     before = settings(shared)
-    words = [word for name, value in before.items() if name != "preempt" for word in (f"--{name}", value)]
-    assert shared.run("set", *words).code == 0
+    options = [part for name, value in before.items() if name != "preempt" for part in (f"--{name}", value)]
+    assert shared.run("set", *options).code == 0
     assert settings(shared) == before
 
 
 def test_an_invalid_value_changes_no_setting(shared: Talk) -> None:
-    for words in (["--rate", "79"], ["--volume", "nan"], ["--ttl", "inf"], ["--voice", ""], ["60"]):
-        done = shared.run("set", "--pitch", "60", *words)
-        assert (done.code, done.out, words[0] in done.err) == (2, "", True)
+    for arguments in (["--rate", "79"], ["--volume", "nan"], ["--ttl", "inf"], ["--voice", ""], ["60"]):
+        done = shared.run("set", "--pitch", "60", *arguments)
+        assert (done.code, done.out, arguments[0] in done.err) == (2, "", True)
     assert settings(shared) == DEFAULTS
 
 
@@ -231,16 +229,16 @@ def test_cancel_stops_exactly_the_goals_that_its_selectors_match(scripted: Talk)
     active = scripted.run("say", "--key", "battery", "never-ends").id
     scripted.watcher.wait_for_word(active)
     keys = ("door", "battery", "lift", "hall")
-    door, battery, lift, hall = (scripted.run("say", "--key", each, "waits").id for each in keys)
+    door, battery, lift, hall = (scripted.run("say", "--key", key, "waits").id for key in keys)
     for key in ("nothing", "batter", "BATTERY", "-"):
         done = scripted.run("cancel", "--key", key)
         assert (done.code, done.out, done.err) == (0, "", "")
-    for words in (["--key", ""], ["--before", ""], ["--key="], ["--key", "k" * 65]):
-        done = scripted.run("cancel", *words)
+    for options in (["--key", ""], ["--before", ""], ["--key="], ["--key", "k" * 65]):
+        done = scripted.run("cancel", *options)
         assert (done.code, done.out) == (2, "")
         assert "key" in done.err or "--before" in done.err
     done = scripted.run("--json", "cancel", "--key", "door", lift)
-    assert {json.loads(each)["id"] for each in done.out.splitlines()} == {door, lift}
+    assert {json.loads(line)["id"] for line in done.out.splitlines()} == {door, lift}
     assert scripted.goal(active)["state"] == "ACTIVE"
     done = scripted.run("cancel", "--key", "battery")
     assert (done.code, set(done.out.split()), done.err) == (0, {active, battery}, "")

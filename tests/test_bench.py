@@ -1,4 +1,4 @@
-"""The benchmark's rows measure something, and the documents show the rows that it has."""
+"""The benchmark's rows measure something, and the documents show the same rows."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from tests.support.documents import BENCHMARK, README, tables
 from tests.support.real_voice import real_voice
 from tests.support.sink import PROGRAMS
 from tests.support.surroundings import needs, needs_packages
-from tests.tools.bench import growing, heard, load, marathon
+from tests.tools.bench import growing, load, marathon, sound
 from tests.tools.bench.__main__ import GROUPS, NAMED, measure
-from tests.tools.bench.stage import TALK, Options, Stage
+from tests.tools.bench.harness import TALK, Harness, Options
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -21,41 +21,41 @@ if TYPE_CHECKING:
 TABLES = tables(BENCHMARK.text)
 
 
-def form(name: str, goal: str) -> tuple[str, str]:
-    """Return a row's name without its numbers, which a short run does not share, and its goal."""
+def without_numbers(name: str, goal: str) -> tuple[str, str]:
+    """Return a row's goal, and its name without numbers, which differ in a short run."""
     return re.sub(r"[0-9][0-9,.]*", "#", name.replace("`", "")), goal
 
 
 @pytest.fixture(scope="module")
-def stage() -> Iterator[Stage]:
+def harness() -> Iterator[Harness]:
     needs(TALK, *PROGRAMS)
-    with Stage(Options(rounds=1, idle=1, sentences=2)) as found:
-        yield found
+    with Harness(Options(rounds=1, idle=1, sentences=2)) as result:
+        yield result
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("group", [*GROUPS, *NAMED])
-def test_every_row_of_a_group_measures_something(stage: Stage, group: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_row_of_a_group_measures_something(harness: Harness, group: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if group == "neural":
         real_voice()
     if group == "fleet":
         needs("mosquitto", "openssl")
         needs_packages("paho")
-    for module, name, less in (
+    for module, name, smaller in (
         *((load, "GOALS", 200), (load, "FEW", 250), (load, "MANY", 300), (load, "PENDING", 300), (load, "CLIENTS", 20)),
         (growing, "TOKENS", 100),
-        *((heard, "LONG_TEXT", heard.LONG_TEXT[:50]), (heard, "_TEXTS", 1), (marathon, "SERVERS", 1)),
+        *((sound, "LONG_TEXT", sound.LONG_TEXT[:50]), (sound, "_TEXTS", 1), (marathon, "SERVERS", 1)),
     ):
-        monkeypatch.setattr(module, name, less)
-    rows = measure(group, stage)
-    assert [each.failure for each in rows if each.failure] == []
-    assert all(len(each.cells()) == len(TABLES[0][0]) and each.values for each in rows)
-    if group not in ("neural", "marathon"):  # which no table shows
-        known = {form(row[0], row[7]) for table in TABLES for row in table[1:]}
-        assert {form(each.name, each.goal) for each in rows} <= known, f"a table in {BENCHMARK.name} is out of date"
+        monkeypatch.setattr(module, name, smaller)
+    rows = measure(group, harness)
+    assert [row.failure for row in rows if row.failure] == []
+    assert all(len(row.cells()) == len(TABLES[0][0]) and row.values for row in rows)
+    if group not in ("neural", "marathon"):  # no table shows these
+        known = {without_numbers(row[0], row[7]) for table in TABLES for row in table[1:]}
+        assert {without_numbers(row.name, row.goal) for row in rows} <= known, f"{BENCHMARK.name} is out of date"
 
 
 def test_the_readme_quotes_numbers_from_the_table() -> None:
-    told = re.findall(r"\d[\d.,]* (?:ms|MB|%)", README.section("Speed"))
-    assert len(told) == 5
-    assert set(told) <= {cell for row in TABLES[0] for cell in row}
+    figures = re.findall(r"\d[\d.,]* (?:ms|MB|%)", README.section("Speed"))
+    assert len(figures) == 5
+    assert set(figures) <= {cell for row in TABLES[0] for cell in row}

@@ -1,4 +1,4 @@
-"""`--connect-timeout`: a client tries again until a server is there, unless that can't help."""
+"""`--connect-timeout`: a client retries until a server runs, unless a retry can't help."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def path(home: str) -> str:
 
 @contextlib.contextmanager
 def serving(path: str, *greetings: bytes) -> Iterator[None]:
-    """Serve one client after another at this path, each with its greeting."""
+    """Serve one client after another at this path, and send one greeting to each."""
     os.makedirs(os.path.dirname(path), exist_ok=True)
     with contextlib.suppress(FileNotFoundError):
         os.unlink(path)
@@ -48,11 +48,11 @@ def serving(path: str, *greetings: bytes) -> Iterator[None]:
         listening.listen()
 
         def serve() -> None:
-            for each in greetings:
+            for greeting in greetings:
                 connected, _ = listening.accept()
                 with connected:
-                    connected.sendall(each)
-                    while each and connected.recv(65536):
+                    connected.sendall(greeting)
+                    while greeting and connected.recv(65536):
                         pass
 
         thread = threading.Thread(target=serve, daemon=True)
@@ -62,7 +62,7 @@ def serving(path: str, *greetings: bytes) -> Iterator[None]:
 
 
 class Waits:
-    """Replaces the pauses between two tries by calls, and records the seconds of all waits."""
+    """A replacement for `wait_ready` that calls `act` instead of pausing, and records the length of all waits."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, act: Callable[[int], object] = lambda _: None) -> None:
         self.pauses: list[float] = []
@@ -81,10 +81,10 @@ class Waits:
         return None
 
 
-def leave_stale(path: str) -> None:
+def create_stale_socket(path: str) -> None:
     os.makedirs(os.path.dirname(path))
-    with socket.socket(socket.AF_UNIX) as left:
-        left.bind(path)
+    with socket.socket(socket.AF_UNIX) as stale:
+        stale.bind(path)
 
 
 @pytest.mark.parametrize(
@@ -92,9 +92,9 @@ def leave_stale(path: str) -> None:
     [
         (lambda _: None, [GREETING]),
         (lambda path: os.makedirs(os.path.dirname(path)), [HANG_UP, GREETING]),
-        (leave_stale, [BUSY, GREETING]),
+        (create_stale_socket, [BUSY, GREETING]),
     ],
-    ids=["no directory", "no socket", "nobody at the socket"],
+    ids=["no directory", "no socket", "stale socket"],
 )
 def test_a_client_reaches_a_server_that_starts_while_it_tries(
     path: str, monkeypatch: pytest.MonkeyPatch, prepare: Callable[[str], None], greetings: list[bytes]
@@ -102,12 +102,12 @@ def test_a_client_reaches_a_server_that_starts_while_it_tries(
     prepare(path)
     with contextlib.ExitStack() as stack:
         waits = Waits(monkeypatch, lambda n: stack.enter_context(serving(path, *greetings)) if n == 3 else None)
-        begun = connect.connect(path, HELLO, keep_trying=60)
-        assert begun.socket
-        begun.socket.close()
+        attempt = connect.connect(path, HELLO, keep_trying=60)
+        assert attempt.socket
+        attempt.socket.close()
     assert len(waits.pauses) == 3 + len(greetings) - 1
     low, high = connect.RETRY_PAUSE_S
-    assert all(low <= each <= high for each in waits.pauses)
+    assert all(low <= seconds <= high for seconds in waits.pauses)
 
 
 @pytest.mark.parametrize(
@@ -146,10 +146,10 @@ def test_a_refusal_at_one_socket_does_not_end_the_wait_for_another(path: str, mo
     with contextlib.ExitStack() as stack:
         stack.enter_context(serving(denied, refusal))
         Waits(monkeypatch, lambda _: stack.enter_context(serving(path, GREETING)))
-        begun = connect.connect(None, HELLO, keep_trying=60)
-        assert begun.socket
-        begun.socket.close()
-    assert begun.path == path
+        attempt = connect.connect(None, HELLO, keep_trying=60)
+        assert attempt.socket
+        attempt.socket.close()
+    assert attempt.path == path
 
 
 @pytest.mark.parametrize(
@@ -163,20 +163,20 @@ def test_the_greeting_and_replies_may_take_the_remaining_time(
         end = None if left is None else time.monotonic() + left
         connection = SocketConnection(path, keep_trying=keep_trying, end=end)
         connection.close()
-    assert all(least <= each <= most for each in waits.others)
+    assert all(least <= seconds <= most for seconds in waits.others)
     assert max(least, 4) <= connection._patience <= max(most, 5)
 
 
 @contextlib.contextmanager
-def trying(path: str, *words: str) -> Iterator[Process]:
-    """Start `talk` with --connect-timeout, hang up on its first tries, and leave it without a server."""
+def client_without_server(path: str, *command: str) -> Iterator[Process]:
+    """Start `talk` with --connect-timeout, hang up on its first three attempts, and remove the socket."""
     os.makedirs(os.path.dirname(path))
     with socket.socket(socket.AF_UNIX) as listening:
         listening.bind(path)
         listening.listen()
         listening.settimeout(PATIENCE)
         env = clean_environment(os.path.dirname(path), {"TALK_SOCKET": path})
-        client = start_talk(["--connect-timeout", "60", *words], env)
+        client = start_talk(["--connect-timeout", "60", *command], env)
         for _ in range(3):
             listening.accept()[0].close()
         os.unlink(path)
@@ -188,7 +188,7 @@ def trying(path: str, *words: str) -> Iterator[Process]:
 
 
 def test_a_sentence_is_spoken_when_the_server_has_started(path: str, make_talk: MakeTalk) -> None:
-    with trying(path, "say", "--wait", "--id", "first", "length=0.1") as client:
+    with client_without_server(path, "say", "--wait", "--id", "first", "length=0.1") as client:
         talk = make_talk(scripted=True, env={"TALK_SOCKET": path})
         out, err = client.communicate(timeout=PATIENCE)
         assert (client.wait(), out) == (0, "first\n"), err
@@ -196,7 +196,7 @@ def test_a_sentence_is_spoken_when_the_server_has_started(path: str, make_talk: 
 
 
 def test_ctrl_c_ends_the_wait_for_a_server(path: str) -> None:
-    with trying(path, "say", "--wait", "hello") as client:
+    with client_without_server(path, "say", "--wait", "hello") as client:
         client.send_signal(signal.SIGINT)
         out, err = client.communicate(timeout=PATIENCE)
         assert (client.wait(), out, err) == (130, "", "")

@@ -1,4 +1,4 @@
-"""Events of the client library: their form in JSON, those of a handle and a watch, and those of many threads."""
+"""Events of the client library: in JSON, from handles, from watches, and in many threads."""
 
 from __future__ import annotations
 
@@ -90,21 +90,21 @@ def test_the_package_exports_every_name_in_all() -> None:
         _ = talkcli.Speaker
 
 
-def told(found: list[Event]) -> list[object]:
-    """Return the events in short: states, words, and results as types."""
+def summary(events: list[Event]) -> list[object]:
+    """Return the states, words and, for other events, types."""
     return [
-        each.state if isinstance(each, StateChanged) else each.word if isinstance(each, WordHeard) else type(each)
-        for each in found
+        event.state if isinstance(event, StateChanged) else event.word if isinstance(event, WordHeard) else type(event)
+        for event in events
     ]
 
 
 def test_the_events_of_a_goal_end_with_its_result(client: Client) -> None:
     handle = client.say("length=0.2 one", feedback=True)
-    found = list(handle.events(5))
-    assert told(found) == [State.PENDING, State.ACTIVE, "length=0.2", "one", State.SUCCEEDED, Result]
-    assert found[-1] == Result(handle.goal)
-    assert [each.id for each in found if not isinstance(each, Result | Snapshot)] == [handle.id] * 5
-    word = found[3]
+    events = list(handle.events(5))
+    assert summary(events) == [State.PENDING, State.ACTIVE, "length=0.2", "one", State.SUCCEEDED, Result]
+    assert events[-1] == Result(handle.goal)
+    assert [event.id for event in events if not isinstance(event, Result | Snapshot)] == [handle.id] * 5
+    word = events[3]
     assert isinstance(word, WordHeard)
     assert (word.number, handle.goal.text and handle.goal.text[word.start : word.end]) == (2, "one")
     assert list(handle.events()) == [Result(handle.goal)]
@@ -119,9 +119,9 @@ def test_feedback_can_be_requested_after_a_goal_was_sent(client: Client, scripte
         scripted.watcher.wait_for(handle.id, "PENDING")
         words = handle.feedback(5)
         first.cancel()
-        assert [each.word for each in words] == ["length=0.1", "one"]
+        assert [word.word for word in words] == ["length=0.1", "one"]
         assert handle.state is State.SUCCEEDED
-    assert told(list(client.say("length=0").events(5))) == [State.PENDING, State.ACTIVE, State.SUCCEEDED, Result]
+    assert summary(list(client.say("length=0").events(5))) == [State.PENDING, State.ACTIVE, State.SUCCEEDED, Result]
 
 
 def test_a_rejected_goal_has_a_result_and_no_words(client: Client) -> None:
@@ -130,7 +130,7 @@ def test_a_rejected_goal_has_a_result_and_no_words(client: Client) -> None:
         assert list(handle.events(1)) == [Result(handle.goal)]
         assert list(handle.feedback(1)) == []
         assert handle.cancel() is handle.goal
-        handle.request_cancel()  # there is nothing to cancel
+        handle.request_cancel()  # must do nothing
     assert client.log()[-1].state is State.REJECTED
 
 
@@ -141,9 +141,9 @@ def test_an_interrupted_feedback_loop_can_be_continued(client: Client) -> None:
         seen.append(word.word)
         if word.word == "one":
             break
-    assert client.goal(handle.id).state is State.ACTIVE  # the connection is as before
+    assert client.goal(handle.id).state is State.ACTIVE  # the connection still works
     assert client.say("length=0", follow=False).state is State.PENDING
-    seen.extend(each.word for each in handle.feedback(5))
+    seen.extend(word.word for word in handle.feedback(5))
     assert seen == ["length=0.3", "one", "two", "three"]
     assert handle.wait(5).state is State.SUCCEEDED
 
@@ -156,8 +156,8 @@ def test_two_handles_of_a_goal_get_the_same_events(client: Client, scripted: Tal
     scripted.watcher.wait_for(handle.id, "PENDING")
     client.cancel(key="first")
     mine, others = list(handle.events(5)), list(other.events(5))
-    assert mine[1:] == others  # all but PENDING, which was before
-    assert told(list(plain.events(5))) == [State.ACTIVE, State.SUCCEEDED, Result]
+    assert mine[1:] == others  # `other` was created after PENDING
+    assert summary(list(plain.events(5))) == [State.ACTIVE, State.SUCCEEDED, Result]
 
 
 def test_feedback_of_an_unknown_goal_is_an_error(client: Client) -> None:
@@ -166,29 +166,29 @@ def test_feedback_of_an_unknown_goal_is_an_error(client: Client) -> None:
 
 
 def polled(handle: GoalHandle) -> list[Event]:
-    """Return what a handle gives until its result, asked again and again."""
-    found: list[Event] = []
+    """Poll a handle until it returns a result, and return all its events."""
+    events: list[Event] = []
     end = time.monotonic() + PATIENCE
-    while not (found and isinstance(found[-1], Result)):
-        assert time.monotonic() < end, found
+    while not (events and isinstance(events[-1], Result)):
+        assert time.monotonic() < end, events
         event = handle.poll()
         if event is None:
-            time.sleep(0.002)  # as a robot's loop, which has other things to do
+            time.sleep(0.002)  # like a robot's loop, which does other work
         else:
-            found.append(event)
-    return found
+            events.append(event)
+    return events
 
 
 def test_poll_returns_each_event_once_then_the_result_then_none(client: Client) -> None:
     handle = client.say("length=0.2 one", feedback=True)
-    found = polled(handle)
-    assert told(found) == [State.PENDING, State.ACTIVE, "length=0.2", "one", State.SUCCEEDED, Result]
-    assert found[-1] == Result(handle.goal)
+    events = polled(handle)
+    assert summary(events) == [State.PENDING, State.ACTIVE, "length=0.2", "one", State.SUCCEEDED, Result]
+    assert events[-1] == Result(handle.goal)
     assert [handle.poll(), handle.poll()] == [None, None]
     assert list(handle.events()) == [Result(handle.goal)]
     heard = client.say("length=0")
-    assert told(list(heard.events(5)))[-1] is Result
-    assert heard.poll() is None  # its result was handed out
+    assert summary(list(heard.events(5)))[-1] is Result
+    assert heard.poll() is None  # its result has been returned
 
 
 def test_poll_never_waits(client: Client, scripted: Talk) -> None:
@@ -196,16 +196,16 @@ def test_poll_never_waits(client: Client, scripted: Talk) -> None:
     scripted.watcher.wait_for_word(handle.id)
     waiting = threading.Thread(target=handle.wait)
     with limits():
-        began = time.monotonic()
-        found = [handle.poll() for _ in range(100)]
-        assert_within(time.monotonic() - began, 0.1, "100 polls of a goal that goes on")
-        waiting.start()  # it reads for all now
-        began = time.monotonic()
-        found += [handle.poll() for _ in range(100)]
-        assert_within(time.monotonic() - began, 0.1, "100 polls beside a thread that waits")
+        started_at = time.monotonic()
+        polls = [handle.poll() for _ in range(100)]
+        assert_within(time.monotonic() - started_at, 0.1, "100 polls of an active goal")
+        waiting.start()  # now this thread reads from the socket
+        started_at = time.monotonic()
+        polls += [handle.poll() for _ in range(100)]
+        assert_within(time.monotonic() - started_at, 0.1, "100 polls while another thread waits")
     client.cancel([handle.id])
-    seen = [each for each in found if each] + polled(handle)  # what the watcher was told may have come here a bit later
-    assert told(seen) == [State.PENDING, State.ACTIVE, "never-ends", State.PREEMPTING, State.PREEMPTED, Result]
+    seen = [event for event in polls if event] + polled(handle)  # some events may arrive after the watcher got them
+    assert summary(seen) == [State.PENDING, State.ACTIVE, "never-ends", State.PREEMPTING, State.PREEMPTED, Result]
     waiting.join(5)
 
 
@@ -214,12 +214,12 @@ def test_poll_of_a_goal_that_is_not_followed_is_an_error(client: Client) -> None
     with pytest.raises(UsageError, match=rf"{handle.id}.*follow=False"):
         handle.poll()
     handle.events()
-    assert told(polled(handle))[-1] is Result
+    assert summary(polled(handle))[-1] is Result
 
 
 @pytest.mark.parametrize("how", ["killed", "frozen"])
 def test_poll_returns_the_result_of_a_lost_goal(scripted: Talk, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
-    began = time.monotonic()
+    started_at = time.monotonic()
     with Client(scripted.socket, timeout=0.5) as client:
         handle = client.say("never-ends words=1")
         if how == "killed":
@@ -227,28 +227,28 @@ def test_poll_returns_the_result_of_a_lost_goal(scripted: Talk, monkeypatch: pyt
         else:
             monkeypatch.setattr("talkcli.client.core.SILENCE_LIMIT_S", 0.3)
             scripted.freeze()
-        assert told(polled(handle))[-1] is Result
+        assert summary(polled(handle))[-1] is Result
         assert (handle.state, handle.goal.reason, handle.poll()) == (State.LOST, "lost", None)
         if how == "frozen":
-            assert time.monotonic() - began >= 0.8
+            assert time.monotonic() - started_at >= 0.8
             assert "nothing for 0.3 s" in (handle.goal.message or "")
             scripted.thaw()
             scripted.run("cancel")
 
 
 def until_all_ended(watch: Iterator[Event], count: int) -> list[Event]:
-    """Return what a watch says until so many goals have ended."""
-    found: list[Event] = []
+    """Return the events of a watch until this number of goals has ended."""
+    events: list[Event] = []
     for event in watch:
-        found.append(event)
+        events.append(event)
         count -= isinstance(event, StateChanged) and event.state.terminal
         if not count:
             break
-    return found
+    return events
 
 
 def test_a_watch_starts_with_a_snapshot_and_then_misses_no_event(client: Client, scripted: Talk) -> None:
-    said = client.say("length=0").wait(5)
+    ended = client.say("length=0").wait(5)
     active, pending = client.say("never-ends words=1"), client.say("length=0")
     scripted.watcher.wait_for_word(active.id)
     watch = client.events()
@@ -256,47 +256,47 @@ def test_a_watch_starts_with_a_snapshot_and_then_misses_no_event(client: Client,
     assert isinstance(snapshot, Snapshot)
     status = snapshot.status
     assert status.active
-    assert (status.active.id, [each.id for each in status.pending]) == (active.id, [pending.id])
-    assert status.recent == (said,)
+    assert (status.active.id, [goal.id for goal in status.pending]) == (active.id, [pending.id])
+    assert status.recent == (ended,)
     with Client(scripted.socket, name="another") as other:
         other.pause()
         other.resume()
         other.say("length=0 hello", follow=False)
         other.cancel([active.id])
-    found = until_all_ended(watch, 3)
-    goals = [each.goal for each in found if isinstance(each, StateChanged) and each.goal]
-    assert [each.state for each in goals] == [State.PENDING, State.PREEMPTED, State.SUCCEEDED, State.SUCCEEDED]
+    events = until_all_ended(watch, 3)
+    goals = [event.goal for event in events if isinstance(event, StateChanged) and event.goal]
+    assert [goal.state for goal in goals] == [State.PENDING, State.PREEMPTED, State.SUCCEEDED, State.SUCCEEDED]
     assert goals[0].client
     assert goals[0].client.name == "another"
-    assert [each.word for each in found if isinstance(each, WordHeard)].count("hello") == 1
-    assert [each.paused for each in found if isinstance(each, PausedChanged)] == [True, False]
-    numbers = [each.n or 0 for each in found if not isinstance(each, Result | Snapshot)]
-    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))  # nothing twice, nothing missing
+    assert [event.word for event in events if isinstance(event, WordHeard)].count("hello") == 1
+    assert [event.paused for event in events if isinstance(event, PausedChanged)] == [True, False]
+    numbers = [event.n or 0 for event in events if not isinstance(event, Result | Snapshot)]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))  # no event is missing or repeated
     handle = client.say("length=0 one", feedback=True)
-    assert told(until_all_ended(watch, 1)) == told(list(handle.events(5)))[:-1]
+    assert summary(until_all_ended(watch, 1)) == summary(list(handle.events(5)))[:-1]
 
 
-def run_all(uses: list[Callable[[], None]]) -> None:
-    """Run each in a thread of its own, and raise the errors."""
-    with ThreadPoolExecutor(len(uses)) as pool:
-        for each in [pool.submit(use) for use in uses]:
-            each.result(60)
+def run_all(functions: list[Callable[[], None]]) -> None:
+    """Run each function in its own thread, and raise the first error."""
+    with ThreadPoolExecutor(len(functions)) as pool:
+        for future in [pool.submit(function) for function in functions]:
+            future.result(60)
 
 
 def check_events(events: list[Event], handle: GoalHandle) -> None:
-    """Assert that these are all the events of one goal, each once and in order."""
+    """Assert that these are all events of one goal, without repetitions and in order."""
     *before, last = events
     assert last == Result(handle.goal)
-    assert not any(isinstance(each, Result | Snapshot) for each in before)
-    states = [each.state for each in before if isinstance(each, StateChanged)]
+    assert not any(isinstance(event, Result | Snapshot) for event in before)
+    states = [event.state for event in before if isinstance(event, StateChanged)]
     assert states[0] is State.PENDING
     for one, next_one in pairwise(states):
-        recalled = (one, next_one) == (State.PENDING, State.RECALLED)  # RECALLING is never told
+        recalled = (one, next_one) == (State.PENDING, State.RECALLED)  # there is no RECALLING event
         assert next_one in TRANSITIONS[one] or recalled, states
     assert states[-1] is handle.state
-    words = [each for each in before if isinstance(each, WordHeard)]
-    assert [each.number for each in words] == list(range(1, len(words) + 1))
-    assert {each.id for each in before if isinstance(each, StateChanged | WordHeard)} == {handle.id}
+    words = [event for event in before if isinstance(event, WordHeard)]
+    assert [word.number for word in words] == list(range(1, len(words) + 1))
+    assert {event.id for event in before if isinstance(event, StateChanged | WordHeard)} == {handle.id}
 
 
 def test_eight_threads_can_say_follow_wait_and_cancel_at_once(make_talk: MakeTalk) -> None:
@@ -330,26 +330,26 @@ def test_eight_threads_can_say_follow_wait_and_cancel_at_once(make_talk: MakeTal
                 assert client.goal(goal.id) == goal
 
         run_all([lambda number=number: use(number) for number in range(count)])  # type: ignore[misc]
-        assert len({each.id for each in handles}) == turns * count
+        assert len({handle.id for handle in handles}) == turns * count
         ended = {State.SUCCEEDED, State.PREEMPTED, State.RECALLED}
-        assert {each.state for each in handles} <= ended
-        assert State.SUCCEEDED in {each.state for each in handles}
+        assert {handle.state for handle in handles} <= ended
+        assert State.SUCCEEDED in {handle.state for handle in handles}
     counts = talk.watcher.terminal_counts()
-    assert {counts[each.id] for each in handles} == {1}
+    assert {counts[handle.id] for handle in handles} == {1}
 
 
 def test_threads_share_the_events_of_one_goal(scripted: Talk) -> None:
-    """Each event goes to one of the threads. The result goes to all."""
+    """One of the threads gets each event. All threads get the result."""
     with Client(scripted.socket) as client:
         words = " ".join(map(str, range(200)))
         handle = client.say(f"length=0.5 {words}", feedback=True)
         taken: list[list[Event]] = [[] for _ in range(4)]
-        run_all([lambda found=found: found.extend(handle.events(30)) for found in taken])  # type: ignore[misc]
-        assert [each[-1] for each in taken] == [Result(handle.goal)] * 4
-        events = [each for found in taken for each in found[:-1] if isinstance(each, StateChanged | WordHeard)]
-        events.sort(key=lambda each: each.n or 0)
+        run_all([lambda part=part: part.extend(handle.events(30)) for part in taken])  # type: ignore[misc]
+        assert [part[-1] for part in taken] == [Result(handle.goal)] * 4
+        events = [event for part in taken for event in part[:-1] if isinstance(event, StateChanged | WordHeard)]
+        events.sort(key=lambda event: event.n or 0)
         check_events([*events, Result(handle.goal)], handle)
-        assert len([each for each in events if isinstance(each, WordHeard)]) == 201
+        assert len([event for event in events if isinstance(event, WordHeard)]) == 201
 
 
 @pytest.mark.parametrize("how", ["killed", "closed"])
@@ -383,6 +383,6 @@ def test_all_waiting_threads_return_if_the_connection_ends(scripted: Talk, how: 
         def wait(handle: GoalHandle) -> None:
             lost.append(handle.wait(30).state is State.LOST)
 
-        uses = [lambda each=each: (hear if int(each.id[-1]) % 2 else wait)(each) for each in handles]
+        uses = [lambda handle=handle: (hear if int(handle.id[-1]) % 2 else wait)(handle) for handle in handles]
         run_all([watch, end, *uses])
         assert lost == [True] * 7

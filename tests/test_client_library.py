@@ -1,4 +1,4 @@
-"""The client library: the options, results and errors of its calls, against a server with the scripted engine."""
+"""The options, results and errors of the client library, with a scripted server."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def client(scripted: Talk) -> Iterator[Client]:
 
 
 def test_wait_returns_the_ended_goal(scripted: Talk, client: Client) -> None:
-    client.pause()  # the goal must still be pending below
+    client.pause()  # the goal must still be pending when it is checked
     handle = client.say("length=0.1 battery low", data={"from": "the test"})
     assert handle.state is State.PENDING
     client.resume()
@@ -68,32 +68,32 @@ def test_wait_returns_the_ended_goal(scripted: Talk, client: Client) -> None:
 
 def test_a_goal_continues_after_a_wait_has_timed_out(scripted: Talk, client: Client) -> None:
     handle = client.say("never-ends")
-    began = time.monotonic()
+    started_at = time.monotonic()
     with pytest.raises(TimeoutError, match=handle.id):
         handle.wait(0.2)
-    assert 0.2 <= time.monotonic() - began < 1
+    assert 0.2 <= time.monotonic() - started_at < 1
     assert scripted.goal(handle.id)["state"] == "ACTIVE"
     assert handle.cancel().state is State.PREEMPTED
     assert handle.wait(0).reason == "canceled"
-    assert handle.cancel() is handle.goal  # again: it has ended
+    assert handle.cancel() is handle.goal  # a second time: the goal has ended
 
 
 def test_cancel_stops_only_the_selected_goals(client: Client, scripted: Talk) -> None:
     handles = [client.say(f"never-ends {number}") for number in range(5)]
     scripted.watcher.wait_for_word(handles[0].id)
-    assert client.cancel([]).canceled == ()  # none is not all
-    assert [each.id for each in client.cancel([handles[4].id]).canceled] == [handles[4].id]
+    assert client.cancel([]).canceled == ()  # an empty list doesn't mean all goals
+    assert [goal.id for goal in client.cancel([handles[4].id]).canceled] == [handles[4].id]
     done = client.cancel(before=handles[1].id.rpartition("-")[2])
-    assert {each.id: each.state for each in done.canceled} == {
+    assert {goal.id: goal.state for goal in done.canceled} == {
         handles[0].id: State.PREEMPTED,
         handles[1].id: State.RECALLED,
     }
-    assert [each.id for each in client.cancel([handles[0].id]).ended] == [handles[0].id]
+    assert [goal.id for goal in client.cancel([handles[0].id]).ended] == [handles[0].id]
     with pytest.raises(UnknownGoal, match="none-1") as unknown:
         client.cancel(["none-1", handles[3].id])
     assert len(unknown.value.items) == 1
     handles[2].request_cancel()
-    assert [each.wait(5).state for each in handles] == [
+    assert [handle.wait(5).state for handle in handles] == [
         *(State.PREEMPTED, State.RECALLED),
         *(State.PREEMPTED, State.RECALLED, State.RECALLED),
     ]
@@ -102,14 +102,14 @@ def test_cancel_stops_only_the_selected_goals(client: Client, scripted: Talk) ->
 
 
 def test_status_goal_voices_and_follow_show_the_servers_state(client: Client, scripted: Talk) -> None:
-    said = client.say("length=0").wait(5)
+    ended = client.say("length=0").wait(5)
     active, pending = client.say("never-ends", follow=False), client.say("never-ends too", follow=False)
     scripted.watcher.wait_for_word(active.id)
     status = client.status()
     assert status.active
     assert status.active.id == active.id
-    assert [each.id for each in status.pending] == [pending.id]
-    assert status.recent == (said,)
+    assert [goal.id for goal in status.pending] == [pending.id]
+    assert status.recent == (ended,)
     assert status.server["pid"] == scripted.pid
     voice = {"id": "en", "language": "en", "name": "scripted", "quality": None, "speakers": None}
     assert client.voices() == [voice]
@@ -117,10 +117,10 @@ def test_status_goal_voices_and_follow_show_the_servers_state(client: Client, sc
         client.goal("none-1")
     with pytest.raises(UnknownGoal):
         client.follow(["none-1"])
-    followed = client.follow([said.id, active.id.rpartition("-")[2], said.id])
-    assert [each.id for each in followed] == [said.id, active.id, said.id]
-    assert followed[0].wait(1) == said
-    assert {each.id for each in client.follow()} == {active.id, pending.id}
+    followed = client.follow([ended.id, active.id.rpartition("-")[2], ended.id])
+    assert [handle.id for handle in followed] == [ended.id, active.id, ended.id]
+    assert followed[0].wait(1) == ended
+    assert {handle.id for handle in client.follow()} == {active.id, pending.id}
     assert client.follow([]) == []
     client.cancel()
     assert followed[1].wait(1).state is State.PREEMPTED
@@ -152,8 +152,8 @@ def test_a_say_without_an_answer_is_an_error() -> None:
 
 
 def test_a_refusal_is_read_even_if_the_server_hangs_up_at_once() -> None:
-    says = b'{"talk": 1, "error": "permission_denied", "message": "not you"}\n'
-    with short_directory() as home, FakeServer(f"{home}/s", [says], closes=True, listens=False):
+    refusal = b'{"talk": 1, "error": "permission_denied", "message": "not you"}\n'
+    with short_directory() as home, FakeServer(f"{home}/s", [refusal], closes=True, listens=False):
         for _ in range(100):  # the server may have hung up before the client says hello
             with pytest.raises(AccessDenied, match="not you"), Client(f"{home}/s"):
                 pass
@@ -162,13 +162,13 @@ def test_a_refusal_is_read_even_if_the_server_hangs_up_at_once() -> None:
 def test_calls_of_a_closed_client_fail_and_its_goals_are_lost(client: Client) -> None:
     handle = client.say("length=0.2")
     client.close()
-    client.close()  # a second time is no error
+    client.close()  # a second time is not an error
     with pytest.raises(ServerUnavailable):
         client.status()
     assert handle.wait(1).state is State.LOST
 
 
-@pytest.mark.parametrize("reads", [False, True], ids=["alone", "while a thread reads"])
+@pytest.mark.parametrize("reads", [False, True], ids=["no other thread", "while a thread reads"])
 def test_closing_a_client_in_a_forked_child_keeps_the_parents_connection(client: Client, reads: bool) -> None:
     goal = client.say("never-ends words=1", feedback=True)
     next(goal.feedback(5))
@@ -176,7 +176,7 @@ def test_closing_a_client_in_a_forked_child_keeps_the_parents_connection(client:
     if reads:
         waiting.start()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of threads beside a fork
+        warnings.simplefilter("ignore", DeprecationWarning)  # about a fork with several threads
         child = os.fork()
     if child == 0:
         try:
@@ -196,16 +196,16 @@ def test_a_full_server_answers_urgent_clients_and_refuses_others(make_talk: Make
     talk = make_talk("--max-clients", "1", scripted=True, watched=False)
     with talk.connect() as only:
         goal_id = only.request("say", text="never-ends", wait=True)["goal"]["id"]
-        began = time.monotonic()
+        started_at = time.monotonic()
         assert talk.run("status", goal_id).code == 0
         assert talk.run("cancel").id == goal_id
         with Client.over(SocketConnection(talk.socket, urgent=True)) as urgent:
-            assert [each.id for each in urgent.status().recent] == [goal_id]
+            assert [goal.id for goal in urgent.status().recent] == [goal_id]
         with pytest.raises(Busy, match="--max-clients"):
             SocketConnection(talk.socket, patience=0.5)
-        assert 0.5 <= time.monotonic() - began < 2.5
+        assert 0.5 <= time.monotonic() - started_at < 2.5
         late = talk.start("say", "--wait", "length=0")
-    assert talk.finish(late).code == 0  # it came in when there was room
+    assert talk.finish(late).code == 0  # it was admitted when a place became free
 
 
 SETTINGS = {"rate": 200, "volume": 1.0, "voice": None, "pitch": 50, "preempt": False, "ttl": None}
@@ -213,16 +213,16 @@ SETTINGS = {"rate": 200, "volume": 1.0, "voice": None, "pitch": 50, "preempt": F
 
 @pytest.fixture(scope="module")
 def untouched() -> Iterator[Client]:
-    """A client of a server that tests must leave as it was: it has spoken nothing, and has its initial settings."""
+    """A client of a server that tests must not change. It has spoken nothing, and has its initial settings."""
     with contextlib.closing(Talk(scripted=True)) as talk, Client(talk.socket) as result:
         yield result
         talk.stop()
 
 
-TAKEN = [each for each in OPTIONS if each.name not in {"wait", "more", "stall"}]
+ROWS = [option for option in OPTIONS if option.name not in {"wait", "more", "stall"}]
 
 
-@pytest.mark.parametrize("row", TAKEN, ids=lambda each: each.name)
+@pytest.mark.parametrize("row", ROWS, ids=lambda option: option.name)
 def test_a_value_of_the_wrong_type_is_refused_and_nothing_is_sent(untouched: Client, row: Option) -> None:
     with pytest.raises(UsageError, match=f"'{row.name}' must be"):
         untouched.say(**{"text": "hello", row.name: object()})  # type: ignore[arg-type]
@@ -234,7 +234,7 @@ def test_a_value_of_the_wrong_type_is_refused_and_nothing_is_sent(untouched: Cli
 
 @pytest.mark.parametrize("options", [{"rate": 79}, {"ttl": math.nan}, {"id": "17"}, {"data": {"a": math.nan}}])
 def test_a_value_out_of_range_is_refused_and_nothing_is_sent(untouched: Client, options: dict[str, Any]) -> None:
-    """`tests/unit/test_options.py` has all limits."""
+    """`tests/unit/test_options.py` tests all limits."""
     with pytest.raises(UsageError):
         untouched.say("hello", **options)
     with pytest.raises(UsageError):
@@ -244,35 +244,35 @@ def test_a_value_out_of_range_is_refused_and_nothing_is_sent(untouched: Client, 
 
 def test_the_options_of_a_goal_reach_the_server(client: Client) -> None:
     first = client.say("never-ends")
-    told = client.say("hello", priority=-3, ttl=60, key="k", id="mine", data={"a": [1]}, voice="en", throttle=0.1)
+    hello = client.say("hello", priority=-3, ttl=60, key="k", id="mine", data={"a": [1]}, voice="en", throttle=0.1)
     goal = client.goal("mine")
     assert (goal.priority, goal.ttl, goal.key, goal.id, goal.data) == (-3, 60.0, "k", "mine", {"a": [1]})
-    assert told.goal == goal
+    assert hello.goal == goal
     replaced = client.say("hello again", key="k")
-    assert (told.wait(5).reason, told.state) == ("replaced", State.RECALLED)
+    assert (hello.wait(5).reason, hello.state) == ("replaced", State.RECALLED)
     higher = client.say("urgent", priority=1)
-    assert [each.id for each in client.status().pending] == [higher.id, replaced.id]
+    assert [goal.id for goal in client.status().pending] == [higher.id, replaced.id]
     last = client.say("length=0 the last", flush=True, rate=80, volume=0.5, pitch=0)
     assert replaced.wait(5).reason == "preempted"
     assert first.wait(5).state is State.PREEMPTED
-    ended = [each.wait(5) for each in (higher, last)]
-    assert [each.state for each in ended] == [State.SUCCEEDED] * 2
-    assert (ended[0].started_at or 0) < (ended[1].started_at or 0)  # of a higher priority: not flushed, and first
+    ended = [handle.wait(5) for handle in (higher, last)]
+    assert [goal.state for goal in ended] == [State.SUCCEEDED] * 2
+    assert (ended[0].started_at or 0) < (ended[1].started_at or 0)  # a higher priority isn't flushed, and is first
 
 
 def test_the_same_id_and_text_attach_to_the_existing_goal(client: Client, scripted: Talk) -> None:
-    scripted.request("pause")  # no word may come before the second handle is attached
+    scripted.request("pause")  # the second handle must be attached before the first word
     first = client.say("length=0.2 one", id="door.1", feedback=True)
     with Client(scripted.socket) as other:
         second = other.say("length=0.2 one", id="door.1", feedback=True)
         assert (first.attached, second.attached) == (False, True)
         other.resume()
-        assert [each.word for each in second.feedback(5)] == ["length=0.2", "one"]
+        assert [word.word for word in second.feedback(5)] == ["length=0.2", "one"]
         assert second.wait(5) == first.wait(5)
         third = other.say("length=0.2 one", id="door.1")
         assert (third.attached, third.goal) == (True, first.goal)
         assert third.wait(0) is third.goal
-        assert [each.to_json()["event"] for each in third.events()] == ["result"]
+        assert [event.to_json()["event"] for event in third.events()] == ["result"]
         conflict = other.say("another text", id="door.1")
     assert (conflict.state, conflict.goal.reason, conflict.attached) == (State.REJECTED, "id_conflict", False)
     assert conflict.id != "door.1"
@@ -288,14 +288,14 @@ def test_a_patient_goal_waits_for_room_in_the_queue(make_talk: MakeTalk) -> None
         states: list[State] = []
         thread = threading.Thread(target=lambda: states.append(client.say("length=0", patient=True).wait(10).state))
         thread.start()
-        assert active.cancel().state is State.PREEMPTED  # the same client goes on beside it
+        assert active.cancel().state is State.PREEMPTED  # the waiting thread doesn't block the client
         assert other.cancel([pending.id]).canceled[0].id == pending.id
         thread.join(10)
         assert states == [State.SUCCEEDED]
 
 
 def test_a_patient_goal_is_not_spoken_after_its_sender_hangs_up(make_talk: MakeTalk, tmp_path: Path) -> None:
-    """The server notices that a waiting client has hung up when it shows that it is alive."""
+    """The server notices a hang-up the next time it reports that it is alive."""
     talk = make_talk("--max-queue", "1", program=patched_serve(tmp_path, subscribers__CLIENT_ALIVE_INTERVAL_S=0.5))
     with Client(talk.socket) as client:
         active = client.say("never-ends")
@@ -303,9 +303,9 @@ def test_a_patient_goal_is_not_spoken_after_its_sender_hangs_up(make_talk: MakeT
         pending = client.say("length=0")
         with talk.connect() as wire:
             wire.send({"seq": 1, "request": "say", "text": "length=0 never heard", "patient": True})
-            wire.request("hello")  # by its reply, the goal has been taken
+            wire.request("hello")  # its reply shows that the goal has been received
         while client.status().server["clients"] != 2:  # the watcher and this client
-            time.sleep(0.05)  # no event tells that a client has gone
+            time.sleep(0.05)  # no event reports that a client has gone
         active.cancel()
         assert pending.wait(5).state is State.SUCCEEDED
         assert client.say("length=0").wait(5).state is State.SUCCEEDED
@@ -315,9 +315,9 @@ def test_a_patient_goal_is_not_spoken_after_its_sender_hangs_up(make_talk: MakeT
 def test_cancel_by_key_stops_every_goal_with_that_key(client: Client) -> None:
     active, other = client.say("never-ends", key="k"), client.say("never-ends", key="j")
     pending = client.say("pending", key="k")
-    assert {each.id for each in client.cancel(key="k").canceled} == {active.id, pending.id}
+    assert {goal.id for goal in client.cancel(key="k").canceled} == {active.id, pending.id}
     assert client.cancel(key="k").canceled == ()
-    assert {each.id for each in client.cancel([other.id], key="k").canceled} == {other.id}
+    assert {goal.id for goal in client.cancel([other.id], key="k").canceled} == {other.id}
     goal = client.say("never-ends")
     wrong: list[dict[str, Any]] = [{"key": ""}, {"key": "k" * 65}, {"ids": [""]}, {"before": ""}]
     for selection in wrong:
@@ -330,10 +330,10 @@ def test_cancel_by_key_stops_every_goal_with_that_key(client: Client) -> None:
 def test_long_lists_of_ids_are_split_into_lines_of_legal_length() -> None:
     assert batches([]) == []
     assert batches(["a", "b", "a"]) == [("a", "b")]
-    for each in ("a" * 64, '"' * 64, "\x01" * 64, "🤖" * 64, "\ud800" * 64, "7"):
-        ids = [f"{each}{number}" for number in range(2_000)]
+    for prefix in ("a" * 64, '"' * 64, "\x01" * 64, "🤖" * 64, "\ud800" * 64, "7"):
+        ids = [f"{prefix}{number}" for number in range(2_000)]
         parts = batches(ids)
-        assert [one for part in parts for one in part] == ids
+        assert [goal_id for part in parts for goal_id in part] == ids
         longest = max(len(encode({"request": "cancel", "ids": list(part), "key": "\ud800" * 64})) for part in parts)
         assert longest < MAX_LINE_BYTES - 1_000
 
@@ -378,20 +378,20 @@ def test_pause_stops_speech_and_resume_continues_it(client: Client, scripted: Ta
     assert client.resume() is None
     handle = client.say("length=0.3 one two", feedback=True)
     scripted.watcher.wait_for_word(handle.id)
-    held = client.pause()
-    assert held
-    assert (held.id, held.state, held.paused) == (handle.id, State.ACTIVE, True)
-    assert client.pause() == held  # a second pause is no error
+    paused = client.pause()
+    assert paused
+    assert (paused.id, paused.state, paused.paused) == (handle.id, State.ACTIVE, True)
+    assert client.pause() == paused  # a second pause is not an error
     assert (handle.speech_paused, handle.goal.paused) == (True, True)
     waiting = client.say("length=0", preempt=False)
     assert (waiting.speech_paused, waiting.state) == (True, State.PENDING)
     with pytest.raises(TimeoutError):
         handle.wait(0.4)
-    gone_on = client.resume()
-    assert gone_on
-    assert (gone_on.id, gone_on.paused) == (handle.id, False)
+    resumed = client.resume()
+    assert resumed
+    assert (resumed.id, resumed.paused) == (handle.id, False)
     events = list(handle.events(5))
-    assert [each.paused for each in events if isinstance(each, PausedChanged)] == [True, False]
-    assert [each.state for each in events if isinstance(each, StateChanged)][-1] is State.SUCCEEDED
+    assert [event.paused for event in events if isinstance(event, PausedChanged)] == [True, False]
+    assert [event.state for event in events if isinstance(event, StateChanged)][-1] is State.SUCCEEDED
     assert not handle.speech_paused
     assert waiting.wait(5).state is State.SUCCEEDED

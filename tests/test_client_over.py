@@ -1,4 +1,4 @@
-"""The library over a transport that is no socket."""
+"""The library with a transport other than a socket."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ class Scripted(Connection):
     def __init__(self) -> None:
         super().__init__(PATIENCE)
         self.path, self.server = "nowhere", ServerInfo("fake")
-        self.asked: list[Request] = []
-        #: events that the next wait receives
+        self.requests: list[Request] = []
+        #: Events for the next calls that wait.
         self.coming: list[JsonObject] = []
 
     def _send(self, exchange: Exchange) -> None:
         if self.ended:
             raise ServerUnavailable(self.ended)
-        self.asked.append(exchange.request)
+        self.requests.append(exchange.request)
         exchange.sent = True
         if isinstance(exchange.request, Cancel):
             self._answer(exchange, canceled=goal("RECALLED"))
@@ -51,7 +51,7 @@ class Scripted(Connection):
     def _answer(self, exchange: Exchange, **fields: object) -> None:
         self.receive(encode({"seq": exchange.number, **fields}), time.monotonic())
 
-    def _step(self, timeout: float, interruptible: bool) -> None:  # noqa: ARG002 - nothing takes time here
+    def _step(self, timeout: float, interruptible: bool) -> None:  # noqa: ARG002 - nothing blocks here
         with self.changed:
             if self.coming:
                 self.listeners.publish(from_json(self.coming.pop(0)))
@@ -79,8 +79,8 @@ def test_a_goal_is_sent_and_followed_to_its_result(scripted: Scripted) -> None:
         handle = client.say("a b c")
         assert (client.path, client.server_pid, handle.state) == ("nowhere", None, State.PENDING)
         scripted.coming = [state("ACTIVE", 1), result()]
-        assert [type(each) for each in handle.events()] == [StateChanged, Result]
-        assert scripted.asked == [Say("a b c", wait=True)]
+        assert [type(event) for event in handle.events()] == [StateChanged, Result]
+        assert scripted.requests == [Say("a b c", wait=True)]
     with pytest.raises(ServerUnavailable, match="closed"):
         client.status()
 
@@ -89,20 +89,20 @@ def test_a_number_means_a_goal_of_the_connected_server(scripted: Scripted) -> No
     client = Client.over(scripted)
     client.goal("12")
     client.cancel(["12", "mine"])
-    assert scripted.asked == [Status("fake-12"), Cancel(("fake-12", "mine"))]
+    assert scripted.requests == [Status("fake-12"), Cancel(("fake-12", "mine"))]
 
 
 def test_a_handle_needs_no_client(scripted: Scripted) -> None:
     handle = GoalHandle(scripted, Goal("g", State.PENDING))
     handle.request_cancel()
     assert handle.cancel().state is State.RECALLED
-    assert scripted.asked == [Cancel(("g",)), Cancel(("g",))]
+    assert scripted.requests == [Cancel(("g",)), Cancel(("g",))]
     late = GoalHandle(scripted, Goal("g", State.PENDING))
     late.events()
-    assert late.state is State.ACTIVE, "as the server says that it is by now"
+    assert late.state is State.ACTIVE, "the current state at the server"
     scripted.coming = [result()]
     assert late.wait().state is State.SUCCEEDED
-    assert scripted.asked[2:] == [Wait(("g",))]
+    assert scripted.requests[2:] == [Wait(("g",))]
 
 
 def test_polling_an_ended_goal_receives_events_of_other_goals(scripted: Scripted) -> None:
@@ -115,29 +115,29 @@ def test_polling_an_ended_goal_receives_events_of_other_goals(scripted: Scripted
 def test_goals_are_followed_as_one_stream(scripted: Scripted) -> None:
     (handle,) = Client.over(scripted).follow(["g"])
     scripted.coming = [state("PREEMPTING", 1), result("PREEMPTED")]
-    assert [(each, type(event)) for each, event in merged([handle])] == [(handle, StateChanged), (handle, Result)]
+    assert [(source, type(event)) for source, event in merged([handle])] == [(handle, StateChanged), (handle, Result)]
 
 
 def test_a_merged_stream_contains_each_pause_once(scripted: Scripted) -> None:
-    late, early = (GoalHandle(scripted, Goal(each, State.PENDING)) for each in ("late", "early"))
+    late, early = (GoalHandle(scripted, Goal(goal_id, State.PENDING)) for goal_id in ("late", "early"))
     pauses = [PausedChanged(paused, None, None, 0.0, n) for n, paused in ((3, True), (5, False), (7, True))]
     early._listen_to(scripted.listeners, feedback=True, now=0.0)
     scripted.listeners.publish(pauses[0])
     late._listen_to(scripted.listeners, feedback=True, now=0.0)
-    for each in pauses[1:]:
-        scripted.listeners.publish(each)
+    for pause in pauses[1:]:
+        scripted.listeners.publish(pause)
     stream = merged([late, early])
     assert [event for _, event in itertools.islice(stream, 3)] == pauses
     scripted.listeners.publish(PausedChanged(False, None, None, 0.0, 9))
-    found = [event for _, event in stream]
-    assert [each.n for each in found if isinstance(each, PausedChanged)] == [9]
+    later = [event for _, event in stream]
+    assert [event.n for event in later if isinstance(event, PausedChanged)] == [9]
 
 
 def test_a_goal_and_a_watch_are_lost_if_the_connection_ends(scripted: Scripted) -> None:
     client = Client.over(scripted)
     handle, watch = client.say("a"), client.events()
     next(watch)
-    assert isinstance(scripted.asked[-1], Watch)
+    assert isinstance(scripted.requests[-1], Watch)
     assert handle.wait().state is State.LOST
     assert "that was all" in (handle.goal.message or "")
     with pytest.raises(Lost, match="at nowhere: that was all"):

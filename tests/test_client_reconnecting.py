@@ -1,4 +1,4 @@
-"""The library without waiting, and across breaks: goals that are sent later or never, and a server that comes back."""
+"""Calls of the library that don't block, and lost connections: goals sent later or never, and server restarts."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from talkcli.protocol.events import Event
     from tests.support.processes import Talk
 
-#: Seconds in which a call counts as one that does not wait.
-AT_ONCE_S = 0.05
+#: A call that takes no longer than this doesn't block.
+NONBLOCKING_S = 0.05
 
 
 @pytest.fixture
@@ -40,19 +40,19 @@ def client(scripted: Talk) -> Iterator[Client]:
 
 
 def poll_until(handle: GoalHandle, done: Callable[[GoalHandle], bool], limit: float = PATIENCE) -> list[Event]:
-    """Poll a goal as a loop does, until something is true of it, and return its events."""
-    found: list[Event] = []
+    """Poll a goal until a condition is true, and return its events."""
+    events: list[Event] = []
     end = time.monotonic() + limit
     while True:
-        began = time.monotonic()
+        started_at = time.monotonic()
         event = handle.poll()
-        assert_within(time.monotonic() - began, AT_ONCE_S, "a poll")
+        assert_within(time.monotonic() - started_at, NONBLOCKING_S, "a poll")
         if event:
-            found.append(event)
+            events.append(event)
         elif done(handle):
-            return found
+            return events
         else:
-            assert time.monotonic() < end, (handle.goal, found)
+            assert time.monotonic() < end, (handle.goal, events)
             time.sleep(0.01)
 
 
@@ -69,8 +69,8 @@ def cancel_often(handle: GoalHandle) -> None:
         handle.request_cancel()
 
 
-def cut(client: Client) -> None:
-    """Break the connection, while the server goes on."""
+def disconnect(client: Client) -> None:
+    """Break the connection. The server keeps running."""
     connection = client._connection
     connection._socket.shutdown(socket.SHUT_RDWR)  # type: ignore[attr-defined]
 
@@ -80,7 +80,7 @@ def restart(talk: Talk) -> None:
     talk.start_server()
 
 
-# Without waiting
+# Nonblocking calls
 
 
 def test_a_nonblocking_say_returns_an_id_at_once(client: Client) -> None:
@@ -89,8 +89,8 @@ def test_a_nonblocking_say_returns_an_id_at_once(client: Client) -> None:
     assert handle.id.startswith("talk:")
     own = client.say("length=0", id="mine", block=False)
     assert own.id == "mine"
-    found = poll_until(handle, ended)
-    assert [type(each).__name__ for each in found] == [
+    events = poll_until(handle, ended)
+    assert [type(event).__name__ for event in events] == [
         *("StateChanged", "StateChanged", "WordHeard", "WordHeard", "StateChanged", "Result"),
     ]
     assert handle.state is State.SUCCEEDED
@@ -123,16 +123,16 @@ def test_a_nonblocking_say_may_be_rejected_or_not_followed(client: Client) -> No
 
 
 def test_calls_do_not_wait_for_a_frozen_server_and_send_the_rest_later(scripted: Talk) -> None:
-    """More is said than the socket holds: what is left is sent by later calls, as long as it may still be sent."""
+    """The goals exceed the socket's buffer. Later calls send the rest, unless it is too late."""
     text = "length=0 " + "a" * 8_000
     with limits(), Client(scripted.socket, timeout=60) as client:
         client.pause()
         scripted.freeze()
         handles: list[GoalHandle] = []
         while len(handles) < 500 and not (handles and handles[-1].state.terminal):
-            began = time.monotonic()
+            started_at = time.monotonic()
             handles.append(client.say(text, priority=len(handles), block=False))
-            assert_within(time.monotonic() - began, AT_ONCE_S, "a say that does not wait")
+            assert_within(time.monotonic() - started_at, NONBLOCKING_S, "a nonblocking say")
         assert (handles[-1].state, handles[-1].goal.reason) == (State.REJECTED, "not_sent")
         assert f"{MAX_UNSENT_BYTES >> 10} KiB" in (handles[-1].goal.message or "")
         assert len(handles) > MAX_UNSENT_BYTES / len(text)
@@ -141,19 +141,19 @@ def test_calls_do_not_wait_for_a_frozen_server_and_send_the_rest_later(scripted:
             cancel_often(handles[0])
         scripted.thaw()
         for handle in handles:
-            poll_until(handle, lambda each: accepted(each) or ended(each))
+            poll_until(handle, lambda handle: accepted(handle) or ended(handle))
         client.cancel()
-        assert {each.wait(PATIENCE).state for each in handles} == {State.RECALLED}
+        assert {handle.wait(PATIENCE).state for handle in handles} == {State.RECALLED}
 
 
 def test_goals_sent_to_a_frozen_server_are_lost_after_the_timeout(scripted: Talk) -> None:
     with Client(scripted.socket, timeout=0.5) as client:
         scripted.freeze()
-        began = time.monotonic()
+        started_at = time.monotonic()
         handle = client.say("length=0", block=False)
-        found = poll_until(handle, ended)
-        assert 0.5 <= time.monotonic() - began < 2
-        assert (found, handle.state, handle.goal.reason) == ([Result(handle.goal)], State.LOST, "lost")
+        events = poll_until(handle, ended)
+        assert 0.5 <= time.monotonic() - started_at < 2
+        assert (events, handle.state, handle.goal.reason) == ([Result(handle.goal)], State.LOST, "lost")
         with pytest.raises(Lost, match=r"within 0\.5 s"):
             client.say("length=0")
         scripted.thaw()
@@ -168,8 +168,9 @@ def test_a_partly_sent_goal_is_rejected_and_the_client_reconnects(scripted: Talk
         handles = [client.say("length=0 " + "a" * 9_900, block=False) for _ in range(40)]
         for handle in handles:
             poll_until(handle, ended)
-        assert [each.state for each in handles] == sorted((each.state for each in handles), key=State.LOST.__ne__)
-        assert {each.goal.reason for each in handles} == {"lost", "not_sent"}
+        states = [handle.state for handle in handles]
+        assert states == sorted(states, key=State.LOST.__ne__)
+        assert {handle.goal.reason for handle in handles} == {"lost", "not_sent"}
         scripted.thaw()
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
@@ -181,7 +182,7 @@ def test_a_partly_sent_goal_is_rejected_and_the_client_reconnects(scripted: Talk
         assert followed.wait(PATIENCE).state in {State.PREEMPTED, State.LOST}
 
 
-# Across breaks
+# Lost connections
 
 
 def test_a_restart_loses_all_goals_and_the_client_uses_the_new_server(client: Client, scripted: Talk) -> None:
@@ -210,12 +211,12 @@ def test_goals_are_followed_again_after_a_reconnect_to_the_same_server(client: C
     pending, ending = client.say("length=0"), client.say("length=0", priority=1)
     with Client(scripted.socket) as other:
         scripted.watcher.wait_for_word(active.id)
-        cut(client)
+        disconnect(client)
         other.cancel([ending.id])
-        assert [each.state for each in (pending, ending)] == [State.PENDING] * 2
+        assert [handle.state for handle in (pending, ending)] == [State.PENDING] * 2
         assert client.status().active
-        found = poll_until(active, ended)
-        states = [each.state for each in found if isinstance(each, StateChanged)]
+        events = poll_until(active, ended)
+        states = [event.state for event in events if isinstance(event, StateChanged)]
         assert states == [*dict.fromkeys(states)]
         assert states[-1] is State.SUCCEEDED
         assert (ending.wait(PATIENCE).state, pending.wait(PATIENCE).state) == (State.RECALLED, State.SUCCEEDED)
@@ -224,13 +225,13 @@ def test_goals_are_followed_again_after_a_reconnect_to_the_same_server(client: C
 def test_a_watch_continues_after_a_reconnect_with_a_new_snapshot(client: Client, scripted: Talk) -> None:
     watch = client.events(reconnect=True)
     assert isinstance(next(watch), Snapshot)
-    cut(client)
+    disconnect(client)
     assert isinstance(next(watch), Snapshot)
     client.say("length=0", follow=False)
     assert isinstance(next(watch), StateChanged)
     seen: list[Event] = []
     taking = threading.Thread(
-        target=lambda: seen.extend(itertools.takewhile(lambda each: not_of(each, "hello"), watch))
+        target=lambda: seen.extend(itertools.takewhile(lambda event: lacks_word(event, "hello"), watch))
     )
     taking.start()
     restart(scripted)
@@ -238,24 +239,24 @@ def test_a_watch_continues_after_a_reconnect_with_a_new_snapshot(client: Client,
     scripted.request("say", text="length=0.8 hello")
     taking.join(PATIENCE)
     assert not taking.is_alive()
-    assert Snapshot in {type(each) for each in seen}
+    assert Snapshot in {type(event) for event in seen}
 
 
 def test_watching_threads_survive_a_server_outage(client: Client, scripted: Talk) -> None:
-    """One of the threads tries to connect, and the others wait for it without a limit."""
+    """One of the threads tries to connect. The others wait for it without a limit."""
     watches = [client.events(reconnect=True) for _ in range(3)]
     for watch in watches:
         next(watch)
     scripted.kill()
     with ThreadPoolExecutor(len(watches)) as pool:
-        found = [pool.submit(next, watch) for watch in watches]
+        futures = [pool.submit(next, watch) for watch in watches]
         time.sleep(0.3)
         scripted.start_server()
-        assert {type(each.result(PATIENCE)) for each in found} == {Snapshot}
+        assert {type(future.result(PATIENCE)) for future in futures} == {Snapshot}
 
 
-def not_of(event: Event, word: str) -> bool:
-    """Return whether an event is not the first of a goal with this word."""
+def lacks_word(event: Event, word: str) -> bool:
+    """Return whether an event contains no goal with this word in its text."""
     return not (isinstance(event, StateChanged) and event.goal and word in (event.goal.text or ""))
 
 
@@ -263,17 +264,17 @@ def test_calls_fail_at_once_while_no_server_runs(client: Client, scripted: Talk)
     scripted.kill()
     with limits():
         for act in (client.status, client.cancel, lambda: client.say("a"), client.log):
-            began = time.monotonic()
+            started_at = time.monotonic()
             with pytest.raises(ServerUnavailable, match=r"no server|nothing was sent"):
                 act()
-            assert_within(time.monotonic() - began, AT_ONCE_S, "a call without a server")
-    time.sleep(1)  # the pause between two attempts is as long as it can be
+            assert_within(time.monotonic() - started_at, NONBLOCKING_S, "a call without a server")
+    time.sleep(1)  # after 1 s, the pause between two attempts has its maximum length
     scripted.start_server()
     handle = client.say("length=0", block=False)
-    began = time.monotonic()
+    started_at = time.monotonic()
     poll_until(handle, ended)
     with limits():
-        assert_within(time.monotonic() - began, 0.8, "the end of a goal after the server's return")
+        assert_within(time.monotonic() - started_at, 0.8, "the end of a goal after the server's return")
     assert handle.state is State.SUCCEEDED
 
 
@@ -289,11 +290,11 @@ def test_cancel_reconnects_without_a_delay(client: Client, scripted: Talk) -> No
 def test_a_goal_without_a_server_is_rejected_after_the_timeout(scripted: Talk) -> None:
     with Client(scripted.socket, timeout=0.5) as client:
         scripted.kill()
-        began = time.monotonic()
+        started_at = time.monotonic()
         handle = client.say("length=0", block=False)
         handle.request_cancel()
         poll_until(handle, ended)
-        assert 0.5 <= time.monotonic() - began < 2
+        assert 0.5 <= time.monotonic() - started_at < 2
         assert (handle.state, handle.goal.reason) == (State.REJECTED, "not_sent")
         assert "no server" in (handle.goal.message or "")
 
@@ -306,7 +307,7 @@ def test_the_timeout_must_be_positive(timeout: float) -> None:
 
 # A robot's loop
 
-#: A robot that is blocked for all of its ride, except for a moment after it was heard; it notes how late it is.
+#: A robot that is blocked during its whole ride, except briefly after it has spoken. It records how late its loop is.
 ROBOT = """
 import json
 import sys
@@ -345,22 +346,22 @@ print(json.dumps(robot.lateness))
 
 
 def test_the_readmes_loop_is_never_late_and_speaks_after_outages(scripted: Talk) -> None:
-    """The server is stopped for 7 s and killed once, beside the same loop without `talk`."""
-    (example,) = [each for each in README.examples("python", "Use it from Python") if "robot.drives" in each]
+    """The server is stopped for 7 s and killed once. The same loop without `talk` runs at the same time."""
+    (example,) = [code for code in README.examples("python", "Use it from Python") if "robot.drives" in code]
     programs = [ROBOT.format(loop=example), ROBOT.format(loop="while robot.drives():\n    pass")]
     with limits(), contextlib.ExitStack() as stack:
         loops = []
-        for each in programs:
-            loop = subprocess.Popen([sys.executable, "-c", each, "14"], env=scripted.env, stdout=subprocess.PIPE)
+        for program in programs:
+            loop = subprocess.Popen([sys.executable, "-c", program, "14"], env=scripted.env, stdout=subprocess.PIPE)
             loops.append(stack.enter_context(loop))
-            stack.callback(loop.kill)  # it ends by itself, unless the test fails
+            stack.callback(loop.kill)  # needed only if the test fails
         scripted.watcher.wait_for(None, "SUCCEEDED")
         scripted.freeze()
         time.sleep(7)
         scripted.thaw()
         back = time.monotonic()
         seen = len(scripted.watcher.events())
-        while not any(each.get("state") == "ACTIVE" for each in scripted.watcher.events()[seen:]):
+        while not any(event.get("state") == "ACTIVE" for event in scripted.watcher.events()[seen:]):
             time.sleep(0.01)
             assert time.monotonic() - back < PATIENCE
         assert_within(time.monotonic() - back, 1.0, "speaking again after the stop")
@@ -368,7 +369,7 @@ def test_the_readmes_loop_is_never_late_and_speaks_after_outages(scripted: Talk)
         back = time.monotonic()
         scripted.watcher.wait_for(None, "ACTIVE")
         assert_within(time.monotonic() - back, 1.0, "speaking again after the restart")
-        with_talk, without = (max(json.loads(each.communicate(timeout=30)[0])) for each in loops)
-        assert [each.returncode for each in loops] == [0, 0]
+        with_talk, without = (max(json.loads(loop.communicate(timeout=30)[0])) for loop in loops)
+        assert [loop.returncode for loop in loops] == [0, 0]
         assert_within(with_talk, without + 0.02, "the latest iteration of a loop with talk")
     scripted.unfinished = True

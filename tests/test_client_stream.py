@@ -12,7 +12,7 @@ import pytest
 from talkcli import Client, State, TextAdded, TextMissing, WordHeard
 from talkcli.errors import Lost, ProtocolMismatch, RequestRefused, ServerUnavailable, UsageError
 from talkcli.frozen import replace
-from tests.test_client_reconnecting import cut, restart
+from tests.test_client_reconnecting import disconnect, restart
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -149,7 +149,7 @@ def test_the_text_continues_over_a_new_connection(talk: Talk, client: Client) ->
     with client.stream() as speech:
         for token in ("One. ", "Two. ", "Three. "):
             assert speech.write(token)
-            cut(client)
+            disconnect(client)
     assert ended(speech) == (State.SUCCEEDED, None, "One. Two. Three. ")
     assert talk.watcher.texts("ACTIVE") == ["One. Two. Three. "]  # a single goal
 

@@ -1,4 +1,4 @@
-"""The client library against a server that follows a script: time limits, ends, interrupts, and bounded buffers."""
+"""The client library with a scripted peer: time limits, lost connections, interrupts and limited line lengths."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 
-def unanswered(peer: Peer) -> None:
+def ignore_say(peer: Peer) -> None:
     peer.receive("say")
 
 
@@ -55,19 +55,19 @@ def test_a_reply_to_pause_may_take_longer_than_the_timeout() -> None:
         peer.reply("resume", paused=False, goal=None)
 
     with serving(play) as path, Client.over(SocketConnection(path, patience=0.2)) as client:
-        held = client.pause()
-        assert held
-        assert held.state is State.ACTIVE
+        paused = client.pause()
+        assert paused
+        assert paused.state is State.ACTIVE
         assert client.resume() is None
 
 
 def test_a_silent_server_is_considered_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("talkcli.client.core.SILENCE_LIMIT_S", 0.3)
-    with serving(unanswered) as path, Client.over(SocketConnection(path, patience=5)) as client:
-        began = time.monotonic()
+    with serving(ignore_say) as path, Client.over(SocketConnection(path, patience=5)) as client:
+        started_at = time.monotonic()
         with pytest.raises(Lost, match=r"nothing for 0\.3 s"):
             client.say("a", patient=True)
-        assert 0.3 <= time.monotonic() - began < 1
+        assert 0.3 <= time.monotonic() - started_at < 1
         with pytest.raises(ServerUnavailable, match="nothing was sent"):
             client.status()
 
@@ -98,12 +98,12 @@ def test_feedback_times_out_even_while_words_arrive() -> None:
 
     with serving(play) as path, Client(path) as client:
         handle = client.say("a", feedback=True)
-        began = time.monotonic()
+        started_at = time.monotonic()
         words: list[WordHeard] = []
         with pytest.raises(TimeoutError, match=r"g has not ended after 0\.3 s"):
             words.extend(handle.feedback(0.3))
         assert words
-        assert 0.3 <= time.monotonic() - began < 3  # what had been read by then is handed out, and no more
+        assert 0.3 <= time.monotonic() - started_at < 3  # only words that had been read by then are returned
 
 
 @pytest.mark.parametrize("timeout", [0, 0.1])
@@ -120,9 +120,9 @@ def test_events_received_by_the_deadline_are_returned(timeout: float) -> None:
         seen: list[Event] = []
         with pytest.raises(TimeoutError):
             seen.extend(handle.events(timeout))
-        assert [each.state for each in seen if isinstance(each, StateChanged)] == [State.PENDING, State.ACTIVE]
+        assert [event.state for event in seen if isinstance(event, StateChanged)] == [State.PENDING, State.ACTIVE]
         with pytest.raises(TimeoutError):
-            next(handle.events(timeout))  # each event is handed out once
+            next(handle.events(timeout))  # each event is returned once
 
 
 def test_a_result_received_before_the_server_disconnects_counts() -> None:
@@ -155,7 +155,7 @@ def test_a_goal_is_lost_if_the_server_disconnects(how: str) -> None:
         handle = client.say("a", feedback=True)
         if how == "events":
             *seen, last = handle.events(5)
-            assert [type(each) for each in seen] == [StateChanged, WordHeard]
+            assert [type(event) for event in seen] == [StateChanged, WordHeard]
             assert last == Result(handle.goal)
         elif how == "feedback":
             assert len(list(handle.feedback(5))) == 1
@@ -163,7 +163,7 @@ def test_a_goal_is_lost_if_the_server_disconnects(how: str) -> None:
             assert handle.wait(5) is handle.goal
         assert (handle.state, handle.goal.reason) == (State.LOST, "lost")
         assert "may still be spoken" in str(handle.goal.message)
-        assert [each for each in handle.events() if isinstance(each, Result)] == [Result(handle.goal)]
+        assert [event for event in handle.events() if isinstance(event, Result)] == [Result(handle.goal)]
 
 
 def test_a_malformed_message_ends_the_connection_and_blocks_no_caller() -> None:
@@ -179,11 +179,11 @@ def test_a_malformed_message_ends_the_connection_and_blocks_no_caller() -> None:
 
 @pytest.fixture
 def interrupt() -> Iterator[tuple[int, int]]:
-    """A descriptor that interrupts, and the one that is written to for it."""
+    """A pipe that interrupts the client: its reading end and its writing end."""
     pipe = os.pipe()
     yield pipe
-    for each in pipe:
-        os.close(each)
+    for descriptor in pipe:
+        os.close(descriptor)
 
 
 @pytest.mark.parametrize(
@@ -205,18 +205,18 @@ def test_an_interrupt_ends_a_wait_and_loses_no_event(
             wait(handle)
         os.read(interrupt[0], 1)
         client.status()
-        assert [type(each) for each in handle.events(5)][-2:] == [WordHeard, Result]
+        assert [type(event) for event in handle.events(5)][-2:] == [WordHeard, Result]
 
 
 @pytest.mark.parametrize(
-    ("kind", "do"),
+    ("kind", "call"),
     [
         ("watch", lambda client: [*client.events()]),
         ("say", lambda client: client.say("a", patient=True)),
         ("pause", Client.pause),
     ],
 )
-def test_an_interrupt_ends_a_long_call(interrupt: tuple[int, int], kind: str, do: Callable[[Client], object]) -> None:
+def test_an_interrupt_ends_a_long_call(interrupt: tuple[int, int], kind: str, call: Callable[[Client], object]) -> None:
     def play(peer: Peer) -> None:
         request = peer.receive(kind)
         if kind == "watch":
@@ -226,7 +226,7 @@ def test_an_interrupt_ends_a_long_call(interrupt: tuple[int, int], kind: str, do
     with serving(play) as path:
         client = Client.over(SocketConnection(path, interrupt={interrupt[0]: select.POLLIN}))
         with client, pytest.raises(Interrupted):
-            do(client)
+            call(client)
 
 
 def test_a_handle_with_feedback_gets_pause_events() -> None:
@@ -263,7 +263,7 @@ def test_a_watch_ends_when_its_iterator_is_dropped() -> None:
     with serving(play) as path, Client(path) as client:
         for _ in client.events():
             break
-        client.events()  # not even begun
+        client.events()  # never iterated
         client.status()
         watches = client._connection.listeners.watches
         assert watches is not None
@@ -271,29 +271,29 @@ def test_a_watch_ends_when_its_iterator_is_dropped() -> None:
 
 
 def test_thousands_of_ids_are_sent_in_lines_of_legal_length() -> None:
-    ids = [f"4k7f-{each}" for each in range(9_000)] + ["é" * 64, "🤖" * 64]
-    asked: list[str] = []
+    ids = [f"4k7f-{number}" for number in range(9_000)] + ["é" * 64, "🤖" * 64]
+    requested: list[str] = []
 
     def play(peer: Peer) -> None:
         for kind in ("wait", "cancel"):
-            asked.clear()
-            while len(asked) < len(ids):
+            requested.clear()
+            while len(requested) < len(ids):
                 request = peer.receive(kind)
-                asked.extend(request["ids"])
+                requested.extend(request["ids"])
                 assert (request.get("key"), request.get("feedback", False)) in ((None, kind == "wait"), ("k", False))
                 if kind == "wait":
-                    items = [{"seq": request["seq"], "goal": goal(goal_id=each)} for each in request["ids"]]
+                    items = [{"seq": request["seq"], "goal": goal(goal_id=goal_id)} for goal_id in request["ids"]]
                     peer.send(*items, {"seq": request["seq"], "ok": True})
                 else:
                     error = {"code": "unknown_goal", "message": f"no {request['ids'][-1]!a}"}
                     ended = {"seq": request["seq"], "ended": goal(goal_id=request["ids"][0])}
                     peer.send(ended, {"seq": request["seq"], "ok": False, "error": error})
-            assert asked == ids
+            assert requested == ids
         assert MAX_LINE_BYTES // 2 < peer.longest <= MAX_LINE_BYTES
 
     with serving(play) as path, Client(path) as client:
         handles = client.follow([*ids, ids[0]], feedback=True)
-        assert [each.id for each in handles] == [*ids, ids[0]]
+        assert [handle.id for handle in handles] == [*ids, ids[0]]
         with pytest.raises(UnknownGoal) as unknown:
             client.cancel(ids, key="k")
         assert len(unknown.value.items) > 2

@@ -1,4 +1,4 @@
-"""The imports of each command that ends by itself: most of its time is spent on them."""
+"""The imports of short commands, which spend most of their time on imports."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.tools.bench.processes import OTHERS
 if TYPE_CHECKING:
     from tests.support.processes import Talk
 
-#: Modules that no client uses: slow ones of the standard library, and the server's part of the package.
+#: Modules that no client uses: slow ones of the standard library, and the server's modules.
 HEAVY = [
     *("asyncio", "concurrent", "multiprocessing", "subprocess", "ssl", "tempfile", "logging", "dataclasses", "pathlib"),
     *("pyttsx3", "espeakng_loader", "platformdirs"),
@@ -26,9 +26,9 @@ HEAVY = [
         "talkcli.server.speech",
     ),
 ]
-#: Modules that only a command that talks to a server needs.
+#: Modules that only commands with a server need.
 CLIENT = ["socket", "select", "talkcli.client.client", "talkcli.client.connection"]
-ALONE = {"serve --print-unit user", "--version", "--help"}
+WITHOUT_SERVER = {"serve --print-unit user", "--version", "--help"}
 
 
 def imported(env: dict[str, str], *command: str) -> set[str]:
@@ -46,10 +46,10 @@ def imported(env: dict[str, str], *command: str) -> set[str]:
     return set(re.findall(r"^import time:.*\| +(\S+)$", done.stderr, re.MULTILINE))
 
 
-@pytest.mark.parametrize("words", OTHERS, ids=" ".join)
-def test_a_command_imports_no_unused_modules(scripted: Talk, words: tuple[str, ...]) -> None:
-    found = imported(scripted.env, "-m", "talkcli", *words)
-    assert "talkcli" in found
-    useless = {*HEAVY, *(CLIENT if " ".join(words) in ALONE else [])}
-    # A command cannot leave out the imports of click: platform and subprocess with Python 3.10.
-    assert useless & (found - imported(scripted.env, "-c", "import click")) == set()
+@pytest.mark.parametrize("command", OTHERS, ids=" ".join)
+def test_a_command_imports_no_unused_modules(scripted: Talk, command: tuple[str, ...]) -> None:
+    modules = imported(scripted.env, "-m", "talkcli", *command)
+    assert "talkcli" in modules
+    useless = {*HEAVY, *(CLIENT if " ".join(command) in WITHOUT_SERVER else [])}
+    # A command can't avoid the imports of click: platform and subprocess with Python 3.10.
+    assert useless & (modules - imported(scripted.env, "-c", "import click")) == set()

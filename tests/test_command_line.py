@@ -1,4 +1,4 @@
-"""The command line: options, output, exit codes and errors of every command, for scripts and for people."""
+"""The options, output, exit codes and errors of all commands."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ GOAL = {
     "heard", "priority", "key", "ttl", "data", "client", "paused", "more", "waits", "queued_at", "started_at",
     "ended_at", "duration", "voice", "output",
 }  # fmt: skip
-#: ESC, a bidi override, a line of its own, a bell, a NEL: none of these may reach a terminal.
+#: ESC, a bidi override, a line break, a bell, a NEL: none of these may reach a terminal.
 HOSTILE = "a\x1b[31mred\u202egnp.exe\nfake line\x07\x85\u2028end"
 RAW = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
 
 
 def error_of(err: str) -> dict[str, Any]:
-    """Return the error in a standard error that is one line of JSON."""
+    """Return the error from a standard error that contains one line of JSON."""
     lines = err.splitlines()
     assert len(lines) == 1, err
     error: dict[str, Any] = json.loads(lines[0])["error"]
@@ -43,11 +43,11 @@ def error_of(err: str) -> dict[str, Any]:
     return error
 
 
-# Usage. `tests/golden/errors.txt` has many more wrong command lines, word by word.
+# Usage errors. `tests/golden/errors.txt` has many more.
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("arguments", "message"),
     [
         (["STATUS"], "unknown command 'STATUS'; did you mean 'status'?"),
         (["stop"], "unknown command 'stop'; did you mean 'cancel'?"),
@@ -76,13 +76,13 @@ def error_of(err: str) -> dict[str, Any]:
         (["serve", "--socket-mode", "777"], "--socket-mode: must be a mode such as "),
     ],
 )
-def test_a_usage_error_suggests_the_next_step(words: list[str], said: str) -> None:
-    done = alone(*words)
+def test_a_usage_error_suggests_the_next_step(arguments: list[str], message: str) -> None:
+    done = alone(*arguments)
     assert (done.code, done.out) == (2, "")
     first, *rest = done.err.splitlines()
-    assert first.startswith(f"talk: {said}")
-    asked = f"talk {words[0]}" if words[0] in COMMANDS else "talk"
-    assert rest == ([] if "--help" in first else [f"talk: see '{asked} --help'"])
+    assert first.startswith(f"talk: {message}")
+    command = f"talk {arguments[0]}" if arguments[0] in COMMANDS else "talk"
+    assert rest == ([] if "--help" in first else [f"talk: see '{command} --help'"])
 
 
 def test_json_after_the_command_applies_to_usage_errors() -> None:
@@ -106,15 +106,15 @@ def test_json_output_has_the_documented_fields(scripted: Talk) -> None:
     assert goal.keys() == GOAL
     assert accepted.out.count("\n") == 1
     scripted.watcher.wait_for_word(goal["id"])
-    pending = json.loads(scripted.run("say", "behind", "it", "--json").out)  # the option may stand after the command
+    pending = json.loads(scripted.run("say", "behind", "it", "--json").out)  # the option may follow the command
     assert (pending["state"], pending["text"], pending["spoken"]) == ("PENDING", "behind it", None)
     status = json.loads(scripted.run("status", "--json").out)
     assert status.keys() == {"server", "active", "pending", "recent"}
-    assert (status["active"]["id"], [each["id"] for each in status["pending"]]) == (goal["id"], [pending["id"]])
+    assert (status["active"]["id"], [goal["id"] for goal in status["pending"]]) == (goal["id"], [pending["id"]])
     assert json.loads(scripted.run("status", "--json", goal["id"]).out).keys() == GOAL
-    canceled = [json.loads(each) for each in scripted.run("cancel", "--json").out.splitlines()]
-    assert {each["id"]: each["state"] for each in canceled} == {goal["id"]: "PREEMPTED", pending["id"]: "RECALLED"}
-    assert all(each.keys() == GOAL for each in canceled)
+    canceled = [json.loads(line) for line in scripted.run("cancel", "--json").out.splitlines()]
+    assert {goal["id"]: goal["state"] for goal in canceled} == {goal["id"]: "PREEMPTED", pending["id"]: "RECALLED"}
+    assert all(goal.keys() == GOAL for goal in canceled)
     ended = json.loads(scripted.run("--json", "say", "--wait", "length=0").out)
     assert (ended.keys(), ended["state"], ended["status"]) == (GOAL, "SUCCEEDED", 3)
     assert json.loads(scripted.run("--json", "wait", ended["id"]).out) == ended
@@ -139,8 +139,8 @@ def test_standard_output_contains_only_data(scripted: Talk) -> None:
 
 
 def test_options_work_before_and_after_the_command(scripted: Talk) -> None:
-    for words in (["--socket", scripted.socket, "status"], ["status", "--socket", scripted.socket]):
-        done = run([*TALK, *words], {**scripted.env, "TALK_SOCKET": "/nowhere"})
+    for arguments in (["--socket", scripted.socket, "status"], ["status", "--socket", scripted.socket]):
+        done = run([*TALK, *arguments], {**scripted.env, "TALK_SOCKET": "/nowhere"})
         assert done.code == 0, done.err
         assert f"pid {scripted.pid}" in done.out
     assert run([*TALK, "status"], {**scripted.env, "TALK_SOCKET": "/nowhere"}).code == 3
@@ -148,23 +148,23 @@ def test_options_work_before_and_after_the_command(scripted: Talk) -> None:
 
 @pytest.fixture
 def local(scripted: Talk, tmp_path: Path) -> dict[str, str]:
-    """Return the environment of a user whose server is in the usual place."""
+    """Return the environment of a user whose server listens on the default socket."""
     (tmp_path / "talk").mkdir()
     (tmp_path / "talk" / "talk.sock").symlink_to(scripted.socket)
     return {**scripted.env, "TALK_SOCKET": "", "XDG_RUNTIME_DIR": str(tmp_path)}
 
 
 def test_an_empty_socket_option_is_refused(scripted: Talk, local: dict[str, str]) -> None:
-    for words in (["--socket", "", "say", "hello"], ["--socket=", "cancel"], ["serve", "--socket", ""]):
-        done = run([*TALK, *words], local)
+    for arguments in (["--socket", "", "say", "hello"], ["--socket=", "cancel"], ["serve", "--socket", ""]):
+        done = run([*TALK, *arguments], local)
         assert (done.code, done.out) == (2, "")
-        assert "--socket: must not be empty; check the variable that it comes from" in done.err
+        assert "--socket: must not be empty; check the variable that should contain the value" in done.err
     assert scripted.watcher.goals() == []
 
 
 def test_empty_variables_count_as_unset(scripted: Talk, local: dict[str, str]) -> None:
-    for words in (["say", "length=0"], ["say", "--lines"], ["wait"], ["status"], ["voices"]):
-        done = run([*TALK, *words], {**local, "TALK_NAME": ""})
+    for arguments in (["say", "length=0"], ["say", "--lines"], ["wait"], ["status"], ["voices"]):
+        done = run([*TALK, *arguments], {**local, "TALK_NAME": ""})
         assert done.code == 0, done
     assert scripted.goal(scripted.watcher.goals()[0])["client"]["name"] is None
     with pytest.MonkeyPatch.context() as patch:
@@ -177,9 +177,9 @@ def test_empty_variables_count_as_unset(scripted: Talk, local: dict[str, str]) -
 
 def test_an_invalid_utf8_name_prevents_speech_but_not_cancel(scripted: Talk, local: dict[str, str]) -> None:
     env = {**local, "TALK_NAME": "n\udcff"}
-    said = run([*TALK, "say", "x"], env)
-    assert (said.code, said.out) == (2, "")
-    assert said.err.startswith("talk: environment variable TALK_NAME: the byte 0xff is not valid UTF-8\n")
+    done = run([*TALK, "say", "x"], env)
+    assert (done.code, done.out) == (2, "")
+    assert done.err.startswith("talk: environment variable TALK_NAME: the byte 0xff is not valid UTF-8\n")
     goal = scripted.run("say", "never-ends").id
     assert run([*TALK, "cancel"], env).code == 0
     assert scripted.goal(goal)["by"]["client"]["name"] == "n\ufffd"
@@ -187,15 +187,15 @@ def test_an_invalid_utf8_name_prevents_speech_but_not_cancel(scripted: Talk, loc
 
 def test_arguments_and_output_are_utf8_in_every_locale(scripted: Talk) -> None:
     ascii_only = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0", "TALK_NAME": "é"}
-    words = ["say", "-w", "--key", "日", "--", "length=0 a\udcff b é"]
-    done = run([*TALK, *words], {**scripted.env, **ascii_only})
+    arguments = ["say", "-w", "--key", "日", "--", "length=0 a\udcff b é"]
+    done = run([*TALK, *arguments], {**scripted.env, **ascii_only})
     assert (done.code, done.err) == (
         0,
-        "talk: line 1, column 11: the byte 0xff is not valid UTF-8, so it is not spoken\n",
+        "talk: line 1, column 11: the byte 0xff is not valid UTF-8 and is skipped\n",
     )
     goal = scripted.goal(done.out.strip())
     assert (goal["text"], goal["key"], goal["client"]["name"]) == ("length=0 a\ufffd b é", "日", "é")
-    few: dict[str, str] = {each: scripted.env[each] for each in ("PYTHONPATH", "TALK_SOCKET") if each in scripted.env}
+    few: dict[str, str] = {name: scripted.env[name] for name in ("PYTHONPATH", "TALK_SOCKET") if name in scripted.env}
     for env in ({**scripted.env, "LANG": "C", "LC_ALL": "C"}, few):
         done = run([*TALK, "--json", "say", "--wait", "--", "d'été 日本"], env)
         assert (done.code, json.loads(done.out)["text"]) == (0, "d'été 日本")
@@ -207,8 +207,9 @@ def test_text_from_others_is_always_escaped(scripted: Talk) -> None:
     scripted.watcher.wait_for_word(goal_id)
     scripted.run("say", "--wait", "--as", "b\x1b]0;title\x07", "-t", "0.1", "--", f"{HOSTILE} pending")
     shown = [scripted.run("status").out, scripted.run("status", goal_id).out]
-    # Text that a script forgot to quote is a command, an option or an id to talk.
-    shown += [scripted.run(*words, HOSTILE).err for words in (["wait"], ["cancel"], ["status"], ["cancel", "--before"])]
+    # If a script forgets the quotes, talk takes text for commands, options or ids.
+    commands = (["wait"], ["cancel"], ["status"], ["cancel", "--before"])
+    shown += [scripted.run(*command, HOSTILE).err for command in commands]
     shown += [scripted.run(HOSTILE).err, scripted.run("say", f"--{HOSTILE}").err, scripted.run("voices", HOSTILE).err]
     shown += [scripted.run("voices", "--language", HOSTILE).err, scripted.log]
     for text in shown:
@@ -218,24 +219,24 @@ def test_text_from_others_is_always_escaped(scripted: Talk) -> None:
     assert r"a\x1b[31mred\u202egnp.exe\nfake line\x07\x85\u2028end" in shown[0]
 
 
-@pytest.mark.parametrize("command", [["status"], ["watch"], ["say", "--id", "theirs", "-w"]])
+@pytest.mark.parametrize("command", [["status"], ["watch"], ["say", "--id", "shared", "-w"]])
 def test_json_on_a_terminal_is_escaped_without_changing_its_meaning(scripted: Talk, command: list[str]) -> None:
     text = f'length=0 {HOSTILE} \x9b31m \x7f \ue000 \U000e0001 "quoted" \\ Grüße 日本 👩'
-    scripted.run("say", "--wait", "--id", "theirs", "--as", "\u202epatrol", "--", text)
-    words = ["--json", *command, *(["--", text] if command[0] == "say" else [])]
-    with Terminal([*TALK, *words], scripted.env) as shown:
+    scripted.run("say", "--wait", "--id", "shared", "--as", "\u202epatrol", "--", text)
+    arguments = ["--json", *command, *(["--", text] if command[0] == "say" else [])]
+    with Terminal([*TALK, *arguments], scripted.env) as shown:
         shown.wait_for("\n")
         if command == ["watch"]:
             shown.type(b"\x03")
         shown.finish()
         line = shown.raw.decode().split("\r\n")[0]
     assert not RAW.search(line), repr(line)
-    for each in (r"\u009b31m \u007f \ue000 \udb40\udc01", "Grüße 日本 👩", r"\u202epatrol"):
-        assert each in line
+    for part in (r"\u009b31m \u007f \ue000 \udb40\udc01", "Grüße 日本 👩", r"\u202epatrol"):
+        assert part in line
     assert json.dumps(text)[1:-1] in json.dumps(json.loads(line))
     if command != ["watch"]:  # a program gets the text unchanged
-        assert json.loads(scripted.run(*words).out)
-        assert "\x9b31m \x7f" in scripted.run(*words).out
+        assert json.loads(scripted.run(*arguments).out)
+        assert "\x9b31m \x7f" in scripted.run(*arguments).out
 
 
 def test_colours_are_used_only_on_terminals(scripted: Talk) -> None:
@@ -244,8 +245,8 @@ def test_colours_are_used_only_on_terminals(scripted: Talk) -> None:
         env = {"TERM": "xterm", **scripted.env, **extra}
         done = run([*TALK, "status"], env)
         assert (done.code, "\x1b" in done.out + done.err) == (0, False)
-        terminal, theirs = pty.openpty()
-        with os.fdopen(theirs, "wb") as stdout, os.fdopen(terminal, "rb", buffering=0) as reader:
+        terminal, client_end = pty.openpty()
+        with os.fdopen(client_end, "wb") as stdout, os.fdopen(terminal, "rb", buffering=0) as reader:
             subprocess.run([*TALK, "status"], env=env, stdin=stdout, stdout=stdout, timeout=20, check=True)
             shown = reader.read(65536)
         assert b"SUCCEEDED" in shown
@@ -258,8 +259,8 @@ def test_colours_are_used_only_on_terminals(scripted: Talk) -> None:
 def test_standard_input_is_read_only_on_request(scripted: Talk) -> None:
     assert json.loads(scripted.run("--json", "say", "-", stdin="one\ntwo\n").out)["text"] == "one\ntwo"
     assert json.loads(scripted.run("--json", "say", "-", "and", stdin="unread").out)["text"] == "- and"
-    for words in (["say", "hello"], ["status"], ["cancel"], ["wait"]):
-        client = scripted.start(*words, stdin=subprocess.PIPE)  # which is never closed
+    for arguments in (["say", "hello"], ["status"], ["cancel"], ["wait"]):
+        client = scripted.start(*arguments, stdin=subprocess.PIPE)  # never closed
         assert client.wait(10) == 0
 
 
@@ -270,15 +271,15 @@ def test_a_timeout_has_no_upper_limit(scripted: Talk) -> None:
         assert scripted.run("wait", "--timeout", seconds, done.id).code == 0
 
 
-# The script, and the processes that may answer
+# The installed script, and other processes at the socket
 
 
 def test_the_installed_script_imports_only_main() -> None:
-    """What pip makes of an entry point imports `re` first; the wheel brings its own script."""
+    """The script that pip generates for an entry point imports `re`. Therefore, the wheel contains its own script."""
     script = Path(cli.__file__).with_name("talk")
     assert os.access(script, os.X_OK)
     lines = script.read_text("utf-8").splitlines()
-    assert (lines[0], [each for each in lines if "import" in each.split()]) == (
+    assert (lines[0], [line for line in lines if "import" in line.split()]) == (
         "#!python",
         ["from talkcli.cli import main"],
     )
@@ -287,7 +288,7 @@ def test_the_installed_script_imports_only_main() -> None:
 
 
 @pytest.mark.parametrize(
-    ("says", "code", "error", "words"),
+    ("greeting", "code", "error", "message"),
     [
         (b'{"talk": 2, "version": "9.1"}\n', 9, "protocol_mismatch", "upgrade this command"),
         (b'{"talk": 0, "version": "0.0"}\n', 9, "protocol_mismatch", "restart the server"),
@@ -299,33 +300,33 @@ def test_the_installed_script_imports_only_main() -> None:
         (GREETING, 3, "no_server", "connection to the server was lost"),
     ],
 )
-def test_an_incompatible_process_at_the_socket_is_reported(says: bytes, code: int, error: str, words: str) -> None:
-    with short_directory() as home, FakeServer(f"{home}/s", [says], closes=True):
+def test_an_incompatible_process_is_reported(greeting: bytes, code: int, error: str, message: str) -> None:
+    with short_directory() as home, FakeServer(f"{home}/s", [greeting], closes=True):
         env = clean_environment(home, {"TALK_SOCKET": f"{home}/s"})
-        began = time.monotonic()
+        started_at = time.monotonic()
         done = run([*TALK, "--json", "status"], env)
-        assert time.monotonic() - began < 2
-    told = error_of(done.err)
-    assert (done.code, told["code"], told["exit"]) == (code, error, code)
-    assert words in told["message"]
+        assert time.monotonic() - started_at < 2
+    reported = error_of(done.err)
+    assert (done.code, reported["code"], reported["exit"]) == (code, error, code)
+    assert message in reported["message"]
 
 
 def test_a_path_that_is_not_a_socket_is_reported_with_the_next_step(tmp_path: Path) -> None:
-    place, file, pipe = (tmp_path / each for each in ("talk", "file", "pipe"))
-    place.mkdir()
+    directory, file, pipe = (tmp_path / name for name in ("talk", "file", "pipe"))
+    directory.mkdir()
     file.touch()
     os.mkfifo(pipe)
-    inside = f"{place}/talk.sock"
+    inside = f"{directory}/talk.sock"
     steps = [f"set TALK_SOCKET to {inside}", f"start one with: talk serve --socket {inside}"]
     others = ["set TALK_SOCKET to a socket", "choose a socket, or leave out --socket"]
-    for named, words, (by_variable, by_option) in (
-        (place, f"a directory, not a socket; use {inside}", steps),
+    for path, message, (by_variable, by_option) in (
+        (directory, f"a directory, not a socket; use {inside}", steps),
         (file, "a file", others),
         (pipe, "a file", others),
     ):
-        done = alone("status", TALK_SOCKET=str(named))
-        assert (done.code, f"{named}: {words}" in done.err) == (3, True)
+        done = alone("status", TALK_SOCKET=str(path))
+        assert (done.code, f"{path}: {message}" in done.err) == (3, True)
         assert f"\n{by_variable}\nor unset TALK_SOCKET" in done.err
-        done = alone("--socket", str(named), "status")
-        assert (done.code, f"{named}: {words}" in done.err) == (3, True)
+        done = alone("--socket", str(path), "status")
+        assert (done.code, f"{path}: {message}" in done.err) == (3, True)
         assert done.err.endswith(f"\n{by_option}\n")

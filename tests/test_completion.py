@@ -1,4 +1,4 @@
-"""Completion: the scripts that are checked in, the offers for a line, and real shells that use them."""
+"""Completion: the checked-in scripts, the offered values, and real shells."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ if TYPE_CHECKING:
     from tests.support.processes import Talk
 
 CHECKED_IN = os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file__))), "completions")
-#: A key with all that a shell or a format could stumble over.
+#: A key with characters that are special to shells or to the output formats.
 KEY = 'low battery, now: it\'s $5 "x" *\\ a;b|c&'
 #: The file of each shell's script.
 FILES = {"bash": "talk.bash", "zsh": "_talk", "fish": "talk.fish"}
-#: For each shell: options against its start files, and commands that load the script and bind ^G to writing the command
-#: line to the file OUT.
+#: For each shell: options that skip its start files, commands that load the script, and commands that let ^G write the
+#: command line to the file OUT.
 SHELLS = {
     "bash": (
         ["--noprofile", "--norc"],
@@ -55,17 +55,17 @@ SHELLS = {
         "bind \\cg 'commandline > OUT'; function fish_prompt; echo 'rea''dy> '; end\n",
     ),
 }
-#: The loader of completions in bash, if it is installed; it takes `talk` for an older program.
+#: bash-completion, if it is installed. It has a completion for an older program named `talk`.
 BASH_COMPLETION = "/usr/share/bash-completion/bash_completion"
 
 
 def offered(line: str, env: Mapping[str, str]) -> list[tuple[str, str]]:
-    """Return the values that are offered at the end of a line, with their help; no errors may be written."""
-    asked = {"_TALK_COMPLETE": "fish_complete", "COMP_WORDS": line, "COMP_CWORD": ""}
-    done = run(TALK, {**env, **asked})
+    """Return the values that are offered at the end of a line, with their help. Errors must not be printed."""
+    request = {"_TALK_COMPLETE": "fish_complete", "COMP_WORDS": line, "COMP_CWORD": ""}
+    done = run(TALK, {**env, **request})
     assert (done.code in {0, 1}, done.err) == (True, ""), done
-    lines = [each.removeprefix("plain,").partition("\t") for each in done.out.splitlines() if each]
-    return [(value, words) for value, _, words in lines]
+    lines = [line.removeprefix("plain,").partition("\t") for line in done.out.splitlines() if line]
+    return [(value, text) for value, _, text in lines]
 
 
 def values(line: str, talk: Talk) -> list[str]:
@@ -74,9 +74,9 @@ def values(line: str, talk: Talk) -> list[str]:
 
 @pytest.fixture
 def busy(make_talk: MakeTalk) -> tuple[Talk, list[str]]:
-    """Return a server, and the ids of a goal that has ended, one that is being spoken and one that waits.
+    """Return a server, and the ids of an ended, an active and a pending goal.
 
-    The server's ids do not begin with the number of a goal, so that each line here fits one id alone.
+    The server's ids don't start with the number of a goal, so that each tested prefix matches only one id.
     """
     scripted = make_talk(scripted=True)
     while scripted.request("status")["server"]["boot"][0] in "123":
@@ -103,7 +103,7 @@ def test_the_command_prints_the_checked_in_script(tmp_path: pathlib.Path, shell:
         assert file.read() == done.out
 
 
-# Offers
+# Offered values
 
 
 def test_commands_options_and_values_are_offered_without_a_server(tmp_path: pathlib.Path) -> None:
@@ -114,24 +114,24 @@ def test_commands_options_and_values_are_offered_without_a_server(tmp_path: path
         ("talk serve --vo", {"--volume", "--voice", "--voice-memory"}),
         ("talk serve --player ", {"pulse", "aplay", "pacat", "pw-cat", "null"}),
         ("talk serve --player=p", {"--player=pulse", "--player=pacat", "--player=pw-cat"}),
-        *((each, {"file"}) for each in ("talk --socket /etc/pa", "talk say -o x")),
+        *((line, {"file"}) for line in ("talk --socket /etc/pa", "talk say -o x")),
         ("talk completion ", set(FILES)),
-        *((each, set()) for each in ("talk say ", "talk nonsense --x", "talk cancel --nonsense", 'talk cancel "')),
+        *((line, set()) for line in ("talk say ", "talk nonsense --x", "talk cancel --nonsense", 'talk cancel "')),
     ):
         assert {value for value, _ in offered(line, env)} == expected, line
 
 
 def test_every_command_and_option_is_offered_with_its_help(tmp_path: pathlib.Path) -> None:
     env = environment(str(tmp_path), TALK_SOCKET=f"{tmp_path}/none")
-    assert dict(offered("talk ", env)) == {each.name: each.summary for each in COMMANDS.values()}
+    assert dict(offered("talk ", env)) == {command.name: command.summary for command in COMMANDS.values()}
     assert {value for value, _ in offered("talk --", env)} >= {"--socket", "--json", "--version"}
     for command in COMMANDS:
         options = dict(offered(f"talk {command} --", env))
         assert {"--socket", "--json", "--quiet", "--help"} <= options.keys()
-        # A shell shows it on the line of the option, and cuts it if it does not fit.
-        assert [each for each in options.values() if len(each) > 60 or not re.fullmatch(r"[A-Z].*[^.]\.", each)] == []
-        shown = "".join((surface.HERE / f"help-{each}.txt").read_text("utf-8") for each in (command, "talk"))
-        assert not [each for each in options if each not in shown]
+        # Shells show the help next to the option, and cut it if it is too long.
+        assert [text for text in options.values() if len(text) > 60 or not re.fullmatch(r"[A-Z].*[^.]\.", text)] == []
+        shown = "".join((surface.HERE / f"help-{name}.txt").read_text("utf-8") for name in (command, "talk"))
+        assert not [option for option in options if option not in shown]
 
 
 def test_goal_ids_are_offered_with_their_texts(busy: tuple[Talk, list[str]]) -> None:
@@ -162,9 +162,9 @@ def test_keys_and_voices_are_offered(busy: tuple[Talk, list[str]]) -> None:
 
 def test_long_texts_are_shortened_and_untypable_keys_are_omitted(scripted: Talk) -> None:
     scripted.request("say", text=f"never-ends {'x' * 1000}", key="a\x1b[31mb")
-    ((_, words),) = offered("talk cancel ", scripted.env)
-    assert len(words) < 80
-    assert words.endswith("…")
+    ((_, text),) = offered("talk cancel ", scripted.env)
+    assert len(text) < 80
+    assert text.endswith("…")
     scripted.request("say", text="waits", key="two\nlines")
     scripted.request("say", text="waits", key="fine")
     assert values("talk cancel --key ", scripted) == ["fine"]
@@ -189,23 +189,23 @@ def test_completion_prints_no_error_if_its_output_cannot_be_written(tmp_path: pa
     assert (done.returncode, done.stderr) == (1, b"")
 
 
-@pytest.mark.parametrize("says", [b"", GREETING, b'{"talk": 9}\n', b"no server of ours\n", None])
+@pytest.mark.parametrize("greeting", [b"", GREETING, b'{"talk": 9}\n', b"no server of ours\n", None])
 @limits()
-def test_completion_is_silent_and_quick_whatever_the_server_does(says: bytes | None) -> None:
+def test_completion_is_silent_and_quick_with_any_server(greeting: bytes | None) -> None:
     with short_directory() as home, contextlib.ExitStack() as stack:
-        if says is not None:
-            stack.enter_context(FakeServer(f"{home}/s", [says]))
+        if greeting is not None:
+            stack.enter_context(FakeServer(f"{home}/s", [greeting]))
         env = environment(home, TALK_SOCKET=f"{home}/s")
 
         def seconds(line: str) -> float:
-            began = time.monotonic()
+            started_at = time.monotonic()
             assert offered(line, env) == []
-            return time.monotonic() - began
+            return time.monotonic() - started_at
 
         lines = ["talk cancel ", "talk status ", "talk cancel --key ", "talk say --voice "]
-        with ThreadPoolExecutor(len(lines)) as beside:
-            took = list(beside.map(seconds, lines))
-    assert_within(max(took), 3, "a completion")  # two times its patience at most, and the start of a program
+        with ThreadPoolExecutor(len(lines)) as pool:
+            durations = list(pool.map(seconds, lines))
+    assert_within(max(durations), 3, "a completion")  # at most two timeouts, and the start of a program
 
 
 # Real shells
@@ -215,7 +215,7 @@ class Shell:
     """An interactive shell that completes `talk`, in a terminal."""
 
     def __init__(self, name: str, talk: Talk, stack: contextlib.ExitStack, lines: str | None = None) -> None:
-        """`lines`: commands of sh that make start files, which load the script; None for no start files."""
+        """`lines`: sh commands that create start files that load the script; None for no start files."""
         needs(name)
         directory = talk.directory
         bare, load, setup = SHELLS[name]
@@ -239,7 +239,7 @@ class Shell:
         self.terminal.wait_for("ready> ", 20)
 
     def complete(self, line: str) -> str:
-        """Type a line and TAB, return the command line that this makes, and clear it."""
+        """Type a line and TAB, and return the completed command line. Then clear the line."""
         self.terminal.type(line.encode() + b"\t\x07")
         written = b""
         while not written.endswith(b"\n"):
@@ -276,24 +276,24 @@ def test_shells_complete_and_quote_ids_keys_and_options(busy: tuple[Talk, list[s
     }
     with contextlib.ExitStack() as stack:
         shell = Shell(name, talk, stack)
-        found = {line: shell.complete(line) for line in expected}
-    assert found == expected
+        completed = {line: shell.complete(line) for line in expected}
+    assert completed == expected
     assert "rror" not in shell.terminal.text
 
 
 @pytest.mark.parametrize("name", SHELLS)
 def test_the_readmes_start_files_load_the_completion(busy: tuple[Talk, list[str]], name: str) -> None:
-    """The start file of bash loads bash-completion first, as on most machines."""
+    """bash loads bash-completion first, as on most machines."""
     talk, _ = busy
     if name == "bash" and not os.path.exists(BASH_COMPLETION):
         needs("bash-completion")
     before = f"mkdir -p ~/.config/fish; echo '. {BASH_COMPLETION}' > ~/.bashrc\n"
     with contextlib.ExitStack() as stack:
         shell = Shell(name, talk, stack, before + block("Completion"))
-        found = [shell.complete(line) for line in ("talk st", "talk cancel /door:o")]
-        if name == "bash":  # by way of bash-completion
+        completed = [shell.complete(line) for line in ("talk st", "talk cancel /door:o")]
+        if name == "bash":  # through bash-completion
             assert shell.complete("sudo talk cancel --before=/door:") == "sudo talk cancel --before=/door:open/1 "
-    assert found == ["talk status ", "talk cancel /door:open/1 "]
+    assert completed == ["talk status ", "talk cancel /door:open/1 "]
     assert "rror" not in shell.terminal.text
 
 

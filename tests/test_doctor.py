@@ -1,4 +1,4 @@
-"""`talk doctor` as a command: beside a running server, and without one, when its own engine process plays."""
+"""The command `talk doctor` with a running server, and without one, when its own engine process plays."""
 
 from __future__ import annotations
 
@@ -36,22 +36,22 @@ if TYPE_CHECKING:
     from tests.support.connection import Message
     from tests.support.sink import Sink
 
-#: Checks that are made only if a neural voice is installed, as in CI.
+#: Checks that run only if a neural voice is installed, as in CI.
 NEURAL = ["neural", "voice files"] if find_spec(REAL_PACKAGE) else []
-#: All checks, in their order.
+#: All checks in order.
 CHECKS = [
     "python", "pyttsx3", "libespeak-ng", "voices", *NEURAL, "session", "player", "device", "cards", "group",
     "sound server", "loudness", "socket", "server", "settings", "recent goals", "sentence",
 ]  # fmt: skip
-#: Seconds in which the doctor ends, whatever it finds.
-LIMIT = 60.0
+#: Limit for one run of the doctor, whatever it finds.
+LIMIT_S = 60.0
 FAST = ("--rate", "450")
-LONG = "this is a sentence that takes longer than all that is looked at meanwhile " * 3
+LONG = "this is a sentence that takes longer than all checks of the doctor together " * 3
 
 
 @pytest.fixture(scope="module")
 def server(sink: Sink) -> Iterator[Talk]:
-    """A server for all tests that use `robot`; the doctor can read its environment."""
+    """A server for all tests that use `robot`. The doctor can read its environment."""
     with contextlib.closing(Talk(FAST, sink=sink, forked=False)) as talk:
         yield talk
         talk.stop()
@@ -59,25 +59,25 @@ def server(sink: Sink) -> Iterator[Talk]:
 
 @pytest.fixture
 def robot(server: Talk) -> Iterator[Talk]:
-    """The same server, silent and at full volume again after each test."""
+    """The same server. After each test, it is silent and at full volume again."""
     yield server
     server.request("cancel")
     server.request("set", volume=1.0)
 
 
 def doctor(env: Mapping[str, str], *options: str, code: int = 4) -> dict[str, dict[str, str]]:
-    """Run the doctor, and return its findings by their checks."""
-    ended, out, err = run_talk(["--json", "doctor", *options], env, LIMIT)
+    """Run the doctor, and return its findings by name of the check."""
+    ended, out, err = run_talk(["--json", "doctor", *options], env, LIMIT_S)
     assert (ended, err) == (code, ""), out
     findings = [json.loads(line) for line in out.splitlines()]
-    for each in findings:
-        assert list(each) == ["check", "state", "message", "next"]
-        assert each["state"] in {"ok", "warning", "failed"}
-        assert (each["next"] is None) == (each["state"] == "ok"), each
-    assert [findings[each]["check"] for each in (0, -1)] == ["python", "sentence"]
-    assert len({each["check"] for each in findings}) == len(findings)
-    assert code == (4 if any(each["state"] == "failed" for each in findings) else 0), out
-    return {each["check"]: each for each in findings}
+    for finding in findings:
+        assert list(finding) == ["check", "state", "message", "next"]
+        assert finding["state"] in {"ok", "warning", "failed"}
+        assert (finding["next"] is None) == (finding["state"] == "ok"), finding
+    assert [findings[index]["check"] for index in (0, -1)] == ["python", "sentence"]
+    assert len({finding["check"] for finding in findings}) == len(findings)
+    assert code == (4 if any(finding["state"] == "failed" for finding in findings) else 0), out
+    return {finding["check"]: finding for finding in findings}
 
 
 @pytest.fixture
@@ -86,24 +86,24 @@ def home(home: str) -> str:
     return home
 
 
-def quick(home: str) -> dict[str, str]:
-    """Return an environment without a server, in which the sentence goes to a file, which takes no time."""
+def file_player(home: str) -> dict[str, str]:
+    """Return an environment without a server, in which the sentence is quickly written to a file."""
     return environment(home, TALK_PLAYER=f"file:{home}/said.wav", TALK_SOCKET=f"{home}/s")
 
 
 def logged(talk: Talk) -> list[Message]:
-    """Return the goals that have ended, oldest first."""
+    """Return the ended goals, oldest first."""
     return [json.loads(line) for line in talk.run("--json", "log").out.splitlines()]
 
 
 def test_without_faults_the_doctors_sentence_is_heard(robot: Talk, sink: Sink) -> None:
     with sink.record() as recording:
-        found = doctor(robot.env, code=0)
-    assert list(found) == CHECKS
-    assert "eSpeak NG" in found["libespeak-ng"]["message"]
-    assert f"{robot.socket} (TALK_SOCKET, process {robot.pid})" in found["socket"]["message"]
-    assert "plays to null" in found["sound server"]["message"]
-    assert "through the server, pulse" in found["sentence"]["message"]
+        findings = doctor(robot.env, code=0)
+    assert list(findings) == CHECKS
+    assert "eSpeak NG" in findings["libespeak-ng"]["message"]
+    assert f"{robot.socket} (TALK_SOCKET, process {robot.pid})" in findings["socket"]["message"]
+    assert "plays to null" in findings["sound server"]["message"]
+    assert "through the server, pulse" in findings["sentence"]["message"]
     goal = logged(robot)[-1]
     assert (goal["text"], goal["state"], goal["client"]["name"]) == (SENTENCE_TEXT, "SUCCEEDED", "talk doctor")
     assert extent(recording.samples)
@@ -112,7 +112,7 @@ def test_without_faults_the_doctors_sentence_is_heard(robot: Talk, sink: Sink) -
 def test_silent_makes_no_sound_and_shows_one_finding_per_line(robot: Talk, sink: Sink) -> None:
     robot.run("set", "--volume", "0.1")
     with sink.record() as recording:
-        done = robot.run("doctor", "--silent", timeout=LIMIT)
+        done = robot.run("doctor", "--silent", timeout=LIMIT_S)
         recording.wait_until_quiet(0.2)
     assert_silent(recording)
     assert done.code == 0
@@ -121,54 +121,55 @@ def test_silent_makes_no_sound_and_shows_one_finding_per_line(robot: Talk, sink:
     assert "a sentence was played without sound by talk doctor's own engine, pulse, 0." in done.out
     assert "volume 0.1, default voice" in done.out
     assert "-> talk set --volume 1" in done.out
-    # The server's environment doesn't tell of the runtime directory that its user may have.
+    # The server's environment doesn't name the runtime directory, although its user may have one.
     warned = ["session", "settings"] if os.path.isdir(f"/run/user/{os.getuid()}") else ["settings"]
     assert [line.split()[1] for line in done.out.splitlines() if line.startswith("warning")] == warned
-    told = f"{len(warned)} warning{'s' * (len(warned) > 1)}"
-    assert done.err == f"talk: a sentence is heard, unless the loudspeaker itself is off; {told}\n"
+    warnings = f"{len(warned)} warning{'s' * (len(warned) > 1)}"
+    assert done.err == f"talk: a sentence is heard, unless the loudspeaker itself is off; {warnings}\n"
 
 
 def test_silent_neither_waits_for_goals_nor_adds_any(robot: Talk) -> None:
-    """As from cron, every five minutes, whatever is being spoken."""
+    """For example from cron, every five minutes, even while goals are spoken."""
     before = logged(robot)
     with Client(robot.socket) as client:
         first = client.say(LONG, rate=80)
         second = client.say("and one that waits")
         assert doctor(robot.env, "--silent", code=0)["sentence"]["state"] == "ok"
         status = client.status()
-        assert (status.active and status.active.id, [each.id for each in status.pending]) == (first.id, [second.id])
+        assert (status.active and status.active.id, [goal.id for goal in status.pending]) == (first.id, [second.id])
         assert logged(robot) == before
 
 
 def test_a_muted_sink_is_a_failure_although_the_sentence_was_played(robot: Talk, sink: Sink) -> None:
     sink.pactl("set-sink-mute", "null", "1")
     try:
-        found = doctor(robot.env, "--silent")
+        findings = doctor(robot.env, "--silent")
     finally:
         sink.pactl("set-sink-mute", "null", "0")
-    assert found["sentence"]["state"] == "ok"
-    assert (found["loudness"]["state"], found["loudness"]["message"]) == ("failed", "the default sink is muted")
+    assert findings["sentence"]["state"] == "ok"
+    assert (findings["loudness"]["state"], findings["loudness"]["message"]) == ("failed", "the default sink is muted")
 
 
 def test_sound_is_not_checked_here_if_the_socket_is_forwarded(robot: Talk, sink: Sink) -> None:
-    """With ssh -L, the forwarder answers, and the server's player is on another machine."""
+    """With ssh -L, the server's player is on another machine."""
     needs("socat")
     forwarded = f"{robot.socket}.here"
     forwarder = subprocess.Popen(["socat", f"UNIX-LISTEN:{forwarded},fork", f"UNIX-CONNECT:{robot.socket}"])
     try:
         while not os.path.exists(forwarded):
             assert forwarder.poll() is None
-            time.sleep(0.01)  # socat doesn't tell when it listens
+            time.sleep(0.01)  # socat doesn't report when it listens
         with sink.record() as recording:
-            found = doctor(robot.env, "--socket", forwarded, code=0)
+            findings = doctor(robot.env, "--socket", forwarded, code=0)
     finally:
         forwarder.kill()
         forwarder.wait()
     assert (
-        "on another machine or in a container: to check its sound, run talk doctor there" in found["session"]["message"]
+        "on another machine or in a container: to check its sound, run talk doctor there"
+        in findings["session"]["message"]
     )
-    assert not found.keys() & {"player", "device", "cards", "group", "sound server", "loudness"}
-    assert "through the server, pulse" in found["sentence"]["message"]
+    assert not findings.keys() & {"player", "device", "cards", "group", "sound server", "loudness"}
+    assert "through the server, pulse" in findings["sentence"]["message"]
     assert extent(recording.samples)
 
 
@@ -179,8 +180,8 @@ tee -a {tmp_path}/played | aplay -q -t raw -f S16_LE -c 1 -r "$1"
 """
     player = write(tmp_path / "player", script, 0o755)
     talk = make_talk("--player", f"{player} {{rate}} {{device}}", "--device", "robot", sink=sink, forked=False)
-    elsewhere = clean_environment(str(tmp_path), {"TALK_SOCKET": talk.socket})
-    code, out, _ = run_talk(["doctor", "--silent"], elsewhere, LIMIT)
+    env = clean_environment(str(tmp_path), {"TALK_SOCKET": talk.socket})
+    code, out, _ = run_talk(["doctor", "--silent"], env, LIMIT_S)
     assert code == 0, out
     assert (tmp_path / "called").read_text() == f"22050 robot {sink.env['PULSE_SERVER']} "
     played = (tmp_path / "played").read_bytes()
@@ -192,15 +193,15 @@ def test_a_failed_custom_player_is_reported_with_a_command_to_test_it(make_talk:
     player = "sh -c 'echo no such card >&2; exit 1'"
     talk = make_talk("--player", player, forked=False)
     step = f"test the player with a second of silence: head -c 44100 /dev/zero | {player}"
-    done = talk.run("-q", "doctor", timeout=LIMIT)
+    done = talk.run("-q", "doctor", timeout=LIMIT_S)
     assert (done.code, done.err) == (4, "")
     shown = done.out.splitlines()[-1]
     assert "sentence      ABORTED, audio_" in shown
     assert shown.endswith(f"no such card -> {step}")
-    found = doctor(talk.env, "--silent")
-    assert found["sentence"]["next"] == step
-    assert found["recent goals"]["state"] == "warning"
-    assert "ABORTED: the last goal, " in found["recent goals"]["message"]
+    findings = doctor(talk.env, "--silent")
+    assert findings["sentence"]["next"] == step
+    assert findings["recent goals"]["state"] == "warning"
+    assert "ABORTED: the last goal, " in findings["recent goals"]["message"]
 
 
 @pytest.mark.slow
@@ -208,12 +209,12 @@ def test_a_hanging_sound_server_is_reported(make_talk: MakeTalk, private_sink: C
     sink = private_sink()
     talk = make_talk(sink=sink, forked=False)
     sink.freeze()
-    found = doctor(talk.env)
+    findings = doctor(talk.env)
     sink.thaw()
-    assert found["sound server"]["state"] == "warning"
-    assert "does not answer from the server" in found["sound server"]["message"]
-    assert found["sentence"]["state"] == "failed"
-    assert found["sentence"]["next"] == found["sound server"]["next"]
+    assert findings["sound server"]["state"] == "warning"
+    assert "does not answer from the server" in findings["sound server"]["message"]
+    assert findings["sentence"]["state"] == "failed"
+    assert findings["sentence"]["next"] == findings["sound server"]["next"]
 
 
 # The sentence, sent to a server
@@ -229,10 +230,10 @@ def test_no_sentence_stays_in_the_queue_of_a_paused_server(scripted: Talk) -> No
 
 def test_a_sentence_that_waits_too_long_is_cancelled(scripted: Talk) -> None:
     with Client(scripted.socket) as client:
-        goals = [client.say(f"{each} never-ends") for each in ("one", "two", "three", "four")]
-        began = time.monotonic()
+        goals = [client.say(f"{number} never-ends") for number in ("one", "two", "three", "four")]
+        started_at = time.monotonic()
         played = sentence.speak_by_server(client, SENTENCE_TEXT, 0.3)
-        assert time.monotonic() - began < 8
+        assert time.monotonic() - started_at < 8
         assert (played.state, played.reason) == (State.RECALLED, "late")
         assert played.message == "not spoken: it was still waiting behind 4 goals after 0.3 s"
         assert (goals[0].state, len(client.status().pending)) == (State.ACTIVE, 3)
@@ -251,18 +252,18 @@ def test_the_sentence_preempts_no_goal(make_talk: MakeTalk) -> None:
         assert first.wait(10).state is State.SUCCEEDED
 
 
-def await_waiting(client: Client) -> None:
+def wait_until_pending(client: Client) -> None:
     while (status := client.status()).active is None or not status.pending:
-        time.sleep(0.01)  # only a watch would tell a client of another's goal
+        time.sleep(0.01)  # only a watch reports goals of other clients
 
 
 def test_a_sentence_cancelled_by_another_client_is_reported(scripted: Talk) -> None:
-    with Client(scripted.socket) as client, Client(scripted.socket) as other, ThreadPoolExecutor(1) as beside:
+    with Client(scripted.socket) as client, Client(scripted.socket) as other, ThreadPoolExecutor(1) as pool:
         other.say("sentence never-ends")
-        playing = beside.submit(sentence.speak_by_server, client, SENTENCE_TEXT, LIMIT)
-        await_waiting(other)
+        playing = pool.submit(sentence.speak_by_server, client, SENTENCE_TEXT, LIMIT_S)
+        wait_until_pending(other)
         other.cancel()
-        played = playing.result(LIMIT)
+        played = playing.result(LIMIT_S)
     assert (played.state, played.reason) == (State.RECALLED, "canceled")
 
 
@@ -270,7 +271,7 @@ def test_a_signal_cancels_the_sentence(scripted: Talk) -> None:
     with Client(scripted.socket) as client:
         client.say("sentence never-ends")
         process = scripted.start("doctor")
-        await_waiting(client)
+        wait_until_pending(client)
         process.send_signal(signal.SIGINT)
         assert scripted.finish(process, 10).code == 128 + signal.SIGINT
         end = time.monotonic() + 5
@@ -285,38 +286,38 @@ def test_a_signal_cancels_the_sentence(scripted: Talk) -> None:
 @pytest.mark.usefixtures("nobody_serves")
 def test_without_a_server_the_doctors_own_engine_is_heard(home: str, sink: Sink) -> None:
     with sink.record() as recording:
-        found = doctor(environment(home, **sink.env, TALK_SOCKET=f"{home}/s"))
+        findings = doctor(environment(home, **sink.env, TALK_SOCKET=f"{home}/s"))
         recording.wait_until_quiet(0.2)
     assert extent(recording.samples)
-    assert {each["check"] for each in found.values() if each["state"] == "failed"} == {"socket"}
-    assert found["socket"]["next"] == "unset TALK_SOCKET, or start a server there: talk serve"
-    assert "by talk doctor's own engine, pulse" in found["sentence"]["message"]
-    assert "server" not in found
+    assert {finding["check"] for finding in findings.values() if finding["state"] == "failed"} == {"socket"}
+    assert findings["socket"]["next"] == "unset TALK_SOCKET, or start a server there: talk serve"
+    assert "by talk doctor's own engine, pulse" in findings["sentence"]["message"]
+    assert "server" not in findings
 
 
 @pytest.mark.usefixtures("nobody_serves")
 def test_without_sound_the_players_error_message_is_shown(home: str) -> None:
     needs("aplay")
-    found = doctor(environment(home, TALK_PLAYER="aplay", ALSA_CONFIG_PATH="/dev/null"))
-    assert found["sentence"]["message"].startswith("ABORTED, audio_device: aplay: audio open error")
-    assert found["sound server"]["state"] == "warning"
-    assert "PULSE_SERVER" in found["sound server"]["message"]
+    findings = doctor(environment(home, TALK_PLAYER="aplay", ALSA_CONFIG_PATH="/dev/null"))
+    assert findings["sentence"]["message"].startswith("ABORTED, audio_device: aplay: audio open error")
+    assert findings["sound server"]["state"] == "warning"
+    assert "PULSE_SERVER" in findings["sound server"]["message"]
 
 
 def test_a_missing_library_fails_its_own_check_and_the_sentence(home: str, tmp_path: Path) -> None:
     write(tmp_path / "pyttsx3.py", "raise ModuleNotFoundError('No module named pyttsx3', name='pyttsx3')\n")
-    found = doctor({**quick(home), **python_path(tmp_path)})
-    assert (found["pyttsx3"]["state"], found["sentence"]["state"]) == ("failed", "failed")
-    assert "pip install pyttsx3" in found["pyttsx3"]["next"]
+    findings = doctor({**file_player(home), **python_path(tmp_path)})
+    assert (findings["pyttsx3"]["state"], findings["sentence"]["state"]) == ("failed", "failed")
+    assert "pip install pyttsx3" in findings["pyttsx3"]["next"]
 
 
 def test_a_server_that_disconnects_is_reported(home: str) -> None:
     greeting = b'{"talk": 1, "version": "0.1", "pid": 1, "boot": "abcd"}\n'
     with FakeServer(f"{home}/s", [greeting], closes=True):
-        found = doctor(quick(home), "--silent")["server"]
-    assert found["state"] == "failed"
-    assert "connection to the server was lost" in found["message"]
-    assert "restart it" in found["next"]
+        finding = doctor(file_player(home), "--silent")["server"]
+    assert finding["state"] == "failed"
+    assert "connection to the server was lost" in finding["message"]
+    assert "restart it" in finding["next"]
 
 
 def test_hanging_programs_only_delay_the_doctor(home: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -326,13 +327,13 @@ def test_hanging_programs_only_delay_the_doctor(home: str, monkeypatch: pytest.M
     monkeypatch.setattr(os, "environ", {**env, "PATH": f"{home}/run:{env['PATH']}"})
     monkeypatch.setattr(sound, "PROGRAM_LIMIT_S", 0.3)
     monkeypatch.setattr(examine, "SENTENCE_LIMIT_S", 0.6)
-    began = time.monotonic()
+    started_at = time.monotonic()
     findings = list(examine.LocalExamination(None, silent=False).findings())
-    assert time.monotonic() - began < LIMIT / 2
+    assert time.monotonic() - started_at < LIMIT_S / 2
     assert next_step(findings)
-    found = {each.check: each.message for each in findings}
-    assert "no answer within 0.3 s" in found["device"]
-    assert "does not answer" in found["sound server"]
+    messages = {finding.check: finding.message for finding in findings}
+    assert "no answer within 0.3 s" in messages["device"]
+    assert "does not answer" in messages["sound server"]
 
 
 def test_a_signal_ends_the_doctor(home: str) -> None:
@@ -349,12 +350,12 @@ def test_a_signal_ends_the_doctor(home: str) -> None:
 def test_the_doctors_process_does_not_load_the_speech_libraries(home: str) -> None:
     code = (
         "import sys\nfrom talkcli.doctor.examine import LocalExamination\n"
-        "found = [each.check for each in LocalExamination(None, silent=True).findings()]\n"
-        "assert found[-1] == 'sentence'\n"
-        "print([each for each in ('pyttsx3', 'espeakng_loader', 'asyncio') if each in sys.modules], end='')\n"
+        "findings = [*LocalExamination(None, silent=True).findings()]\n"
+        "assert findings[-1].check == 'sentence'\n"
+        "print([name for name in ('pyttsx3', 'espeakng_loader', 'asyncio') if name in sys.modules], end='')\n"
         "print('espeak' in open('/proc/self/maps').read() if sys.platform == 'linux' else False)\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], env=quick(home), capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, "-c", code], env=file_player(home), capture_output=True, text=True, timeout=60, check=True
     )
     assert done.stdout == "[]False\n"

@@ -1,4 +1,4 @@
-"""How `talk doctor` gathers facts: sockets, engine processes, programs that hang or are missing, and system files."""
+"""How `talk doctor` examines sockets, engine processes, programs and system files."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from talkcli.doctor.report import Finding
     from tests.conftest import MakeTalk
 
-#: No user of this sound.
+#: A user without access to this machine's sound.
 STRANGER = UserSession(4141, "stranger", gids=(4242,))
 PW_NODES = """
 \tid 31, type PipeWire:Interface:Node/3
@@ -52,7 +52,7 @@ PW_NODES = """
 
 @pytest.fixture
 def home(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """Return a directory with all usual places of a socket, except the system's."""
+    """Return a directory that contains all usual socket paths, except the system's."""
     with short_directory() as path:
         os.makedirs(f"{path}/run/talk", 0o700)
         monkeypatch.setenv("TMPDIR", path)
@@ -61,7 +61,7 @@ def home(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
 
 def no_server(named: str | None = None) -> Finding:
-    """Return the finding about the missing server, with this TALK_SOCKET."""
+    """Return the finding about the missing server. `named` is the value of TALK_SOCKET."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TALK_SOCKET", named or "")
         client, finding = server.connect(None, None)
@@ -74,15 +74,15 @@ def no_server(named: str | None = None) -> Finding:
 def test_the_state_of_each_usual_socket_path_is_described(home: str) -> None:
     path = f"{home}/run/talk/talk.sock"
 
-    def check(words: str, step: str) -> None:
-        found = no_server()
+    def check(message: str, step: str) -> None:
+        finding = no_server()
         others = ("/run/talk/talk.sock: not found", f"{home}/runtime-{os.getuid()}/talk/talk.sock: not found")
-        assert [each for each in (f"{path}: {words}", *others) if each not in found.message] == []
-        assert found.next == step
+        assert [part for part in (f"{path}: {message}", *others) if part not in finding.message] == []
+        assert finding.next == step
 
     check("not found", "talk serve")
-    with socket.socket(socket.AF_UNIX) as left:
-        left.bind(path)
+    with socket.socket(socket.AF_UNIX) as stale:
+        stale.bind(path)
     check("no server responds (left over from an earlier server)", "talk serve (it replaces the old socket)")
     os.unlink(path)
     write(Path(path), "")
@@ -91,31 +91,29 @@ def test_the_state_of_each_usual_socket_path_is_described(home: str) -> None:
 
 @pytest.mark.usefixtures("nobody_serves")
 def test_a_talk_socket_that_is_not_a_socket_is_reported(home: str) -> None:
-    found = no_server(f"{home}/run")
-    assert f"{home}/run: a directory, not" in found.message
-    assert found.next == f"name the socket in this directory: TALK_SOCKET={home}/run/talk.sock"
+    finding = no_server(f"{home}/run")
+    assert f"{home}/run: a directory, not" in finding.message
+    assert finding.next == f"name the socket in this directory: TALK_SOCKET={home}/run/talk.sock"
     write(Path(home, "file"), "")
-    found = no_server(f"{home}/file")
-    assert f"{home}/file: a file, not a" in found.message
-    assert found.next == "unset TALK_SOCKET, or name a socket instead of a file"
+    finding = no_server(f"{home}/file")
+    assert f"{home}/file: a file, not a" in finding.message
+    assert finding.next == "unset TALK_SOCKET, or name a socket instead of a file"
 
 
 @pytest.mark.usefixtures("nobody_serves")
 @pytest.mark.parametrize(
-    ("greeting", "words", "step"),
+    ("greeting", "message", "step"),
     [
         ("220 mail ready", "is not a talk server", "restart the server on"),
         ('{"talk": 2, "version": "9"}', "upgrade", "install the same version of talk"),
         ('{"talk": 1, "error": "permission_denied"}', "refused", "--socket-mode 0660"),
     ],
 )
-def test_a_process_that_answers_but_admits_no_client_is_reported(
-    home: str, greeting: str, words: str, step: str
-) -> None:
+def test_a_process_that_admits_no_client_is_reported(home: str, greeting: str, message: str, step: str) -> None:
     with FakeServer(f"{home}/s", [f"{greeting}\n".encode()], closes=True):
-        found = no_server(f"{home}/s")
-    assert words in found.message
-    assert step in str(found.next)
+        finding = no_server(f"{home}/s")
+    assert message in finding.message
+    assert step in str(finding.next)
 
 
 @pytest.mark.usefixtures("nobody_serves")
@@ -126,19 +124,19 @@ def test_a_stopped_or_full_server_is_reported(make_talk: MakeTalk, monkeypatch: 
         assert wire.request("hello")["ok"]
         assert "--max-clients" in str(no_server(talk.socket).next)
     talk.freeze()
-    found = no_server(talk.socket)
+    finding = no_server(talk.socket)
     talk.thaw()
-    assert found.message.endswith(f"{talk.socket}: a stopped process is listening")
-    assert found.next == f"continue the process: kill -CONT {talk.pid}"
+    assert finding.message.endswith(f"{talk.socket}: a stopped process is listening")
+    assert finding.next == f"continue the process: kill -CONT {talk.pid}"
 
 
 @pytest.mark.usefixtures("nobody_serves")
 def test_a_wrong_talk_socket_is_reported_with_the_running_server(home: str) -> None:
     os.chmod(f"{home}/run", 0o700)
     with serving(environment(home, XDG_RUNTIME_DIR=f"{home}/run")):
-        found = no_server(f"{home}/wrong")
-    assert f"TALK_SOCKET names {home}/wrong: not found" in found.message
-    assert found.next == f"unset TALK_SOCKET: a server is running on {home}/run/talk/talk.sock"
+        finding = no_server(f"{home}/wrong")
+    assert f"TALK_SOCKET names {home}/wrong: not found" in finding.message
+    assert finding.next == f"unset TALK_SOCKET, because a server is running on {home}/run/talk/talk.sock"
 
 
 @pytest.mark.usefixtures("nobody_serves")
@@ -151,33 +149,33 @@ def test_another_users_server_is_reported_and_receives_no_data(home: str) -> Non
     os.chmod(f"{home}/run/talk", 0o777)
     path = f"{home}/run/talk/talk.sock"
     with impostor(path) as heard:
-        found = no_server()
-        assert heard() == b"b''\n", "it hung up without a word"
-    assert f"{path}: another user's server (uid {NOBODY})" in found.message
-    assert f"if you trust uid {NOBODY}, run: talk --socket {path} doctor" in str(found.next)
+        finding = no_server()
+        assert heard() == b"b''\n", "it hung up without sending anything"
+    assert f"{path}: another user's server (uid {NOBODY})" in finding.message
+    assert f"if you trust uid {NOBODY}, run: talk --socket {path} doctor" in str(finding.next)
 
 
 # Engine processes
 
 
-def unable(directory: Path, named: str | None = None) -> Finding:
-    """Return why an engine process cannot start that finds the modules and libraries of this directory first."""
+def engine_fault(directory: Path, named: str | None = None) -> Finding:
+    """Return the fault of an engine process that searches this directory first for modules and libraries."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(directory)
         env = environment(str(directory), LD_LIBRARY_PATH=str(directory))
-        found = voice.judge_engine("2.99", voice.probe_engine(voice.EngineOptions(voice=named, env=env)), server=None)[
-            -1
-        ]
-    assert found.state == FAILURE
-    return found
+        finding = voice.judge_engine(
+            "2.99", voice.probe_engine(voice.EngineOptions(voice=named, env=env)), server=None
+        )[-1]
+    assert finding.state == FAILURE
+    return finding
 
 
 def test_the_reason_why_an_engine_cannot_start_is_reported(tmp_path: Path) -> None:
-    found = unable(tmp_path, "klingon-7")
-    assert (found.check, 'unknown voice "klingon-7"' in found.message) == ("voices", True)
+    finding = engine_fault(tmp_path, "klingon-7")
+    assert (finding.check, 'unknown voice "klingon-7"' in finding.message) == ("voices", True)
     (tmp_path / "libespeak-ng.so.1").write_bytes(b"no library")
     library = os.path.join(os.path.dirname(espeakng_loader.__file__), "libespeak-ng.so")
-    for name, text, words in (
+    for name, text, message in (
         ("espeakng_loader", "raise ModuleNotFoundError('', name='espeakng_loader')", "libespeak-ng is missing"),
         (
             "espeakng_loader",
@@ -187,9 +185,9 @@ def test_the_reason_why_an_engine_cannot_start_is_reported(tmp_path: Path) -> No
         ("pyttsx3", "import os\nos.kill(os.getpid(), 11)", "SIGSEGV"),
     ):
         write(tmp_path / f"{name}.py", f"{text}\n")
-        found = unable(tmp_path)
-        assert (found.check, words in found.message) == ("libespeak-ng", True), found
-        assert "apt-get install" in str(found.next)
+        finding = engine_fault(tmp_path)
+        assert (finding.check, message in finding.message) == ("libespeak-ng", True), finding
+        assert "apt-get install" in str(finding.next)
         (tmp_path / f"{name}.py").unlink()
 
 
@@ -197,9 +195,9 @@ def test_the_reason_why_an_engine_cannot_start_is_reported(tmp_path: Path) -> No
 
 
 def env_with(directory: Path, **scripts: str) -> dict[str, str]:
-    """Return an environment with these programs and no others on its PATH."""
-    for name, does in scripts.items():
-        write(directory / name.replace("_", "-"), f"#!/bin/sh\n{does}\n", 0o755)
+    """Return an environment with only these programs on its PATH."""
+    for name, script in scripts.items():
+        write(directory / name.replace("_", "-"), f"#!/bin/sh\n{script}\n", 0o755)
     return {"PATH": str(directory)}
 
 
@@ -218,23 +216,23 @@ def test_a_programs_output_is_kept_and_its_error_is_one_line(tmp_path: Path) -> 
 def test_a_hanging_program_is_killed_with_its_children(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sound, "PROGRAM_LIMIT_S", 0.3)
     env = env_with(tmp_path, hangs=f"/bin/sleep 98 & echo $! > {tmp_path}/pid; /bin/sleep 98")
-    began = time.monotonic()
-    said = sound.run_program("hangs", env=env)
-    assert said.timed_out
-    assert said.error == "no answer within 0.3 s"
-    assert time.monotonic() - began < 20
+    started_at = time.monotonic()
+    output = sound.run_program("hangs", env=env)
+    assert output.timed_out
+    assert output.error == "no answer within 0.3 s"
+    assert time.monotonic() - started_at < 20
     child = int((tmp_path / "pid").read_text())
     end = time.monotonic() + 5
     while _runs(child):
-        assert time.monotonic() < end, "its child goes on"
-        time.sleep(0.01)  # nothing tells of the end of a process that is no child of ours
+        assert time.monotonic() < end, "its child is still running"
+        time.sleep(0.01)  # the end of another program's child isn't reported
 
 
 def test_a_child_that_keeps_a_programs_output_open_is_not_awaited(tmp_path: Path) -> None:
-    began = time.monotonic()
-    said = sound.run_program("leaves", env=env_with(tmp_path, leaves="echo out; /bin/sleep 2.7 &"))
-    assert (said.stdout, said.timed_out) == ("out\n", False)
-    assert time.monotonic() - began < 2.7
+    started_at = time.monotonic()
+    output = sound.run_program("leaves", env=env_with(tmp_path, leaves="echo out; /bin/sleep 2.7 &"))
+    assert (output.stdout, output.timed_out) == ("out\n", False)
+    assert time.monotonic() - started_at < 2.7
 
 
 def _runs(pid: int) -> bool:
@@ -249,8 +247,8 @@ def test_installed_players_are_found_in_order_of_preference(tmp_path: Path) -> N
     env = env_with(tmp_path, **dict.fromkeys(("pacat", "aplay", "mine"), "exit 0"))
     assert sound.installed_players({"PATH": "/nowhere"}) == []
     assert sound.installed_players(env) == ["aplay", "pacat"]
-    runs = {each: sound.check_player(env, each, each, by_server=False).state == OK for each in ("mine -x", "theirs")}
-    assert runs == {"mine -x": True, "theirs": False}
+    assert sound.check_player(env, "mine -x", "mine -x", by_server=False).state == OK
+    assert sound.check_player(env, "missing", "missing", by_server=False).state != OK
 
 
 APLAY = "printf 'null\\n    Discard\\ndefault\\n    Default\\nplughw:CARD=Device,DEV=0\\n    USB\\n'"
@@ -259,9 +257,9 @@ APLAY = "printf 'null\\n    Discard\\ndefault\\n    Default\\nplughw:CARD=Device
 def test_the_devices_of_each_player_are_listed(tmp_path: Path) -> None:
     pactl = "printf '0\\tusb\\tm.c\\ts16le 2ch 44100Hz\\tSUSPENDED\\n1\\thdmi\\tm.c\\ts16le 2ch 44100Hz\\tIDLE\\n'"
     env = env_with(tmp_path, aplay=APLAY, pactl=pactl, pw_cli=f"/bin/cat <<'X'{PW_NODES}X")
-    found = {each: sound.check_device(env, each, None) for each in ("aplay", "pulse", "pacat", "pw-cat")}
-    assert {each.state for each in found.values()} == {OK}
-    assert {player: each.message for player, each in found.items()} == {
+    findings = {player: sound.check_device(env, player, None) for player in ("aplay", "pulse", "pacat", "pw-cat")}
+    assert {finding.state for finding in findings.values()} == {OK}
+    assert {player: finding.message for player, finding in findings.items()} == {
         "aplay": "the default device; aplay -L lists default, plughw:CARD=Device,DEV=0",
         "pulse": "the default device; pactl list short sinks lists usb, hdmi",
         "pacat": "the default device; pactl list short sinks lists usb, hdmi",
@@ -275,23 +273,21 @@ def test_a_device_is_looked_up_in_its_players_list(tmp_path: Path) -> None:
     env = env_with(tmp_path, aplay=APLAY)
     for wanted in ("default", "plughw:1,0"):
         assert sound.check_device(env, "aplay", wanted).state == OK
-    found = sound.check_device(env, "aplay", "robot_speaker")
-    assert (found.state, "robot_speaker is not in the list of aplay -L" in found.message) == (WARNING, True)
-    assert "plughw:CARD=Device,DEV=0" in found.message
-    assert sound.check_device(env, "pacat", None).state == OK, "it is a fault only if a device is named"
-    found = sound.check_device(env, "pacat", "usb")
-    assert (found.state, found.next) == (WARNING, "sudo apt-get install -y pulseaudio-utils")
+    finding = sound.check_device(env, "aplay", "robot_speaker")
+    assert (finding.state, "robot_speaker is not a device that aplay -L lists" in finding.message) == (WARNING, True)
+    assert "plughw:CARD=Device,DEV=0" in finding.message
+    assert sound.check_device(env, "pacat", None).state == OK, "it is a fault only if a device is given"
+    finding = sound.check_device(env, "pacat", "usb")
+    assert (finding.state, finding.next) == (WARNING, "sudo apt-get install -y pulseaudio-utils")
     env = env_with(tmp_path, aplay="exit 0")
     assert sound.check_device(env, "aplay", None).state == WARNING
 
 
-def test_the_errors_of_failed_and_hanging_programs_are_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_errors_of_failed_and_hanging_programs_are_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sound, "PROGRAM_LIMIT_S", 0.3)
     env = env_with(tmp_path, aplay="exec /bin/sleep 98", pactl="echo Connection refused >&2; exit 1")
-    found = [sound.check_device(env, player, None) for player in ("aplay", "pacat", "pw-cat")]
-    assert [(each.state, re.split(": |because ", each.message)[-1]) for each in found] == [
+    findings = [sound.check_device(env, player, None) for player in ("aplay", "pacat", "pw-cat")]
+    assert [(finding.state, re.split(": |because ", finding.message)[-1]) for finding in findings] == [
         (WARNING, "no answer within 0.3 s"), (OK, "Connection refused"), (OK, "pw-cli is not installed")
     ]  # fmt: skip
     assert sound.find_sound_server(env, STRANGER).hangs is False
@@ -299,19 +295,19 @@ def test_the_errors_of_failed_and_hanging_programs_are_reported(
 
 
 def test_a_sound_server_is_found_by_its_program_or_its_socket(tmp_path: Path) -> None:
-    for each in ("pulse", "wire", "run/pulse"):
-        (tmp_path / each).mkdir(parents=True)
+    for name in ("pulse", "wire", "run/pulse"):
+        (tmp_path / name).mkdir(parents=True)
     env = env_with(tmp_path / "pulse", pactl="printf 'Server Name: pulseaudio\\nDefault Sink: usb\\n'")
-    found = sound.find_sound_server(env, STRANGER)
-    assert (found.name, found.sink) == ("pulseaudio", "usb")
+    sound_server = sound.find_sound_server(env, STRANGER)
+    assert (sound_server.name, sound_server.sink) == ("pulseaudio", "usb")
     env = env_with(tmp_path / "pulse", pactl="echo Connection refused >&2; exit 1", pw_cli="exit 0")
-    found = sound.find_sound_server(env, STRANGER)
-    assert ("PipeWire" in str(found.name), found.accepts_pulse) == (True, False)
+    sound_server = sound.find_sound_server(env, STRANGER)
+    assert ("PipeWire" in str(sound_server.name), sound_server.accepts_pulse) == (True, False)
     native = tmp_path / "run" / "pulse" / "native"
     native.touch()
     alone = {"PATH": "/nowhere", "XDG_RUNTIME_DIR": str(tmp_path / "run")}
-    found = sound.find_sound_server(alone, STRANGER)
-    assert (found.name, found.error, found.sockets) == (None, None, (str(native),))
+    sound_server = sound.find_sound_server(alone, STRANGER)
+    assert (sound_server.name, sound_server.error, sound_server.sockets) == (None, None, (str(native),))
     native.unlink()
     wire = {**alone, **env_with(tmp_path / "wire", pw_cli="exit 0")}
     with socket.socket(socket.AF_UNIX) as server:
@@ -348,7 +344,7 @@ def test_the_volume_is_read_from_the_active_mixer(tmp_path: Path) -> None:
 
 @pytest.fixture
 def nodes(tmp_path: Path) -> str:
-    """Return a directory with the device files of a card that only its group may open, and of one for everybody."""
+    """Return a directory with device files: one card is for its group only, and one for everybody."""
     for name, mode in (("pcmC0D0p", 0o660), ("pcmC0D0c", 0o660), ("pcmC1D0p", 0o666)):
         write(tmp_path / name, "", mode)
     return str(tmp_path)
@@ -358,10 +354,10 @@ def test_access_to_a_card_depends_on_user_group_and_mode(nodes: str, monkeypatch
     group = os.stat(f"{nodes}/pcmC0D0p").st_gid
     name = grp.getgrgid(group).gr_name if group else "audio"
     monkeypatch.setattr(sound, "_name_or_id", lambda _, number: name if number == group else str(number))
-    found = sound.check_access(SoundServer(), STRANGER, nodes)
-    assert (found.state, found.next) == (WARNING, f"sudo usermod -aG {name} stranger, and log in again")
-    assert found.message == f"user stranger may not open {nodes}/pcmC0D0p, and is not in the group {name}"
-    assert sound.check_access(SoundServer("PipeWire"), STRANGER, nodes).state == OK, "it opens them"
+    finding = sound.check_access(SoundServer(), STRANGER, nodes)
+    assert (finding.state, finding.next) == (WARNING, f"sudo usermod -aG {name} stranger, and log in again")
+    assert finding.message == f"user stranger may not open {nodes}/pcmC0D0p, and is not in the group {name}"
+    assert sound.check_access(SoundServer("PipeWire"), STRANGER, nodes).state == OK, "the sound server opens the cards"
     member = UserSession(4141, "member", gids=(group,))
     assert sound.check_access(SoundServer(), member, nodes).message == (
         f"user member may open the cards (in the group {name})"
@@ -389,14 +385,14 @@ def test_a_server_of_the_same_user_is_examined_with_its_environment(tmp_path: Pa
     with subprocess.Popen(["sh", "-c", "sleep 98; :", "--player", "x"], env=env, start_new_session=True) as process:
         try:
             end = time.monotonic() + 5
-            while sound._read_environment(process.pid) != env:  # the process has ours until its program has started
+            while sound._read_environment(process.pid) != env:  # until the program has started, it has ours
                 assert time.monotonic() < end
-            found, seen = sound.find_session(process.pid)
+            session, seen = sound.find_session(process.pid)
             assert seen == env
-            assert (found.server_pid, found.uid, found.runtime_dir) == (process.pid, os.getuid(), str(tmp_path))
-            assert found.runtime_owner == os.getuid()
-            assert "an ssh session" in found.origins
-            assert set(found.gids) == {os.getegid(), *os.getgroups()}
+            assert (session.server_pid, session.uid, session.runtime_dir) == (process.pid, os.getuid(), str(tmp_path))
+            assert session.runtime_owner == os.getuid()
+            assert "an ssh session" in session.origins
+            assert set(session.gids) == {os.getegid(), *os.getgroups()}
             assert sound.names_a_player(process.pid, {})
         finally:
             os.killpg(process.pid, 9)
@@ -404,9 +400,9 @@ def test_a_server_of_the_same_user_is_examined_with_its_environment(tmp_path: Pa
 
 def test_without_a_server_the_current_process_is_examined(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", f"{tmp_path}/gone")
-    found, seen = sound.find_session(None)
-    assert (found.server_pid, found.runtime_owner, seen) == (None, None, dict(os.environ))
-    assert f"{tmp_path}/gone, which does not exist" in sound.judge_session(found).message
+    session, seen = sound.find_session(None)
+    assert (session.server_pid, session.runtime_owner, seen) == (None, None, dict(os.environ))
+    assert f"{tmp_path}/gone, which does not exist" in sound.judge_session(session).message
     monkeypatch.delenv("XDG_RUNTIME_DIR")
     assert sound.find_session(None)[0].runtime_dir is None
     assert sound.names_a_player(os.getpid(), {"TALK_PLAYER": "x"})

@@ -1,4 +1,4 @@
-"""`talk doctor` and neural voices: the packages that they need, their files, and the voice in use, loaded and timed."""
+"""How `talk doctor` checks neural voices: their packages, their files, and the voice in use."""
 
 from __future__ import annotations
 
@@ -30,37 +30,37 @@ if TYPE_CHECKING:
 
 __all__ = ["home"]
 
-#: Hides the voices of packages, so that only the voices of a test are found.
-ALONE = """
+#: Hides the voices of packages, so that only the test's voices are found.
+WITHOUT_PACKAGES = """
 import importlib, sys
 from talkcli.engine import models
 models._PACKAGE_SUFFIX = "no such package"
 """
 TRIED = r"is in use: loaded in \d+\.\d s, speaks \d+\.\d times as fast as real time, uses \d+ MB"
-LIMIT = 20.0
+LIMIT_S = 20.0
 
 
 @pytest.fixture
 def alone(home: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
-    """Return an environment with the voice that hums, and no other."""
+    """Return an environment whose only neural voice is the tiny test voice."""
     needs_packages(*NEURAL_PACKAGES)
     monkeypatch.setattr("talkcli.engine.models._PACKAGE_SUFFIX", "no such package")
     tiny_voice.put(Path(home) / "v", "tiny")
-    return _environment(home, tmp_path, ALONE)
+    return _environment(home, tmp_path, WITHOUT_PACKAGES)
 
 
 def _environment(home: str, tmp_path: Path, code: str) -> dict[str, str]:
-    """Return an environment without a server, in which each Python runs this code first."""
+    """Return an environment without a server, in which each Python process runs this code first."""
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(code)
     env = environment(home, TALK_SOCKET=f"{home}/s", TALK_VOICES=f"{home}/v", TALK_PLAYER=f"file:{home}/said.wav")
     return {**env, "PYTHONPATH": f"{tmp_path / 'site'}:{env.get('PYTHONPATH', '')}"}
 
 
-def _found(used: str | None, env: dict[str, str], limit: float = LIMIT) -> dict[str, Finding]:
-    """Return the findings about the voices of this environment, by their checks."""
-    found = voice.check_neural(used, EngineOptions(env=env), limit, None)
-    return {each.check: each for each in found}
+def _found(used: str | None, env: dict[str, str], limit: float = LIMIT_S) -> dict[str, Finding]:
+    """Return the findings about the voices in this environment, by name of the check."""
+    findings = voice.check_neural(used, EngineOptions(env=env), limit, None)
+    return {finding.check: finding for finding in findings}
 
 
 def test_the_voice_in_use_is_loaded_and_timed(alone: dict[str, str]) -> None:
@@ -68,7 +68,7 @@ def test_the_voice_in_use_is_loaded_and_timed(alone: dict[str, str]) -> None:
     assert checks["neural"]["state"] == "ok"
     assert re.search(r"onnxruntime \d+\.\d+.*, numpy \d+\.\d+", checks["neural"]["message"])
     assert checks["voice files"] == {
-        "check": "voice files", "state": "ok", "message": "complete and safe: piper/tiny", "next": None
+        "check": "voice files", "state": "ok", "message": "the files of piper/tiny are complete and safe", "next": None
     }  # fmt: skip
     assert checks["neural voice"]["state"] == "ok"
     assert re.match(f"piper/ti {TRIED}", checks["neural voice"]["message"]), checks
@@ -87,73 +87,73 @@ def test_faulty_files_are_reported_one_by_one_with_the_next_step(alone: dict[str
     files = _found(None, alone)["voice files"]
     assert files.state == WARNING
     json, model = f"{place}/a.onnx.json", f"{place}/a.onnx"
-    words = f"piper/a: {json} and {model} can be changed by other users, which is unsafe"
-    assert files.message == f"{words}; also faulty: piper/b, piper/c"
+    message = f"piper/a: {json} and {model} can be changed by other users, which is unsafe"
+    assert files.message == f"{message}; also faulty: piper/b, piper/c"
     subprocess.run(["/bin/sh", "-c", str(files.next)], check=True)
-    found = _found(None, alone)
-    assert found["voice files"].message.startswith(f"piper/b: {place}/b.onnx.json does not exist")
-    assert found["voice files"].next == "download it from the source of the model"
-    assert "neural voice" not in found, "no voice is in use"
+    findings = _found(None, alone)
+    assert findings["voice files"].message.startswith(f"piper/b: {place}/b.onnx.json does not exist")
+    assert findings["voice files"].next == "download it from the source of the model"
+    assert "neural voice" not in findings, "no voice is in use"
 
 
 @pytest.mark.parametrize(
-    ("model", "speakers", "words", "step"),
+    ("model", "speakers", "message", "step"),
     [
         (b"no model", 1, "is not an ONNX model", "download the voice again, from a source that you trust"),
         (None, 2, "only one of them has several speakers", "download both again"),
     ],
-    ids=["garbage", "another's json"],
+    ids=["garbage", "wrong json"],
 )
 def test_the_fault_of_a_voice_that_cannot_speak_is_reported(
-    alone: dict[str, str], home: str, model: bytes | None, speakers: int, words: str, step: str
+    alone: dict[str, str], home: str, model: bytes | None, speakers: int, message: str, step: str
 ) -> None:
     tiny_voice.put(Path(home) / "v", "bad", model or tiny_voice.model(speakers=speakers))
-    found = _found("piper/bad", alone)["neural voice"]
-    assert found.state == FAILURE
-    assert found.message.startswith(f"piper/bad is in use: {home}/v/bad.onnx")
-    assert words in found.message
-    assert found.next == step
+    finding = _found("piper/bad", alone)["neural voice"]
+    assert finding.state == FAILURE
+    assert finding.message.startswith(f"piper/bad is in use: {home}/v/bad.onnx")
+    assert message in finding.message
+    assert finding.next == step
 
 
 @pytest.mark.parametrize(
-    ("code", "words", "step", "used"),
+    ("code", "message", "step", "used"),
     [
         ("os.kill(os.getpid(), 4)", "it was killed by SIGILL", "this processor is too old", "piper/tiny"),
         ("raise ImportError('no libgomp.so.1')", "ImportError: no libgomp.so.1", "install it again", None),
     ],
 )
-def test_a_broken_package_is_reported(tmp_path: Path, code: str, words: str, step: str, used: str | None) -> None:
+def test_a_broken_package_is_reported(tmp_path: Path, code: str, message: str, step: str, used: str | None) -> None:
     needs_packages(*NEURAL_PACKAGES)
     package = f"import os\nassert os.environ['ORT_DISABLE_TELEMETRY'] == '1'\n{code}\n"
     (tmp_path / "onnxruntime.py").write_text(package)
-    found = _found(used, {**os.environ, "PYTHONPATH": str(tmp_path)})
-    assert found["neural"].state == (FAILURE if used else WARNING)
-    assert re.match(f"onnxruntime .* cannot be imported: {re.escape(words)}$", found["neural"].message)
-    assert str(found["neural"].next).startswith(step)
-    assert "neural voice" not in found
+    findings = _found(used, {**os.environ, "PYTHONPATH": str(tmp_path)})
+    assert findings["neural"].state == (FAILURE if used else WARNING)
+    assert re.match(f"onnxruntime .* cannot be imported: {re.escape(message)}$", findings["neural"].message)
+    assert str(findings["neural"].next).startswith(step)
+    assert "neural voice" not in findings
 
 
 def test_a_slow_import_is_not_reported_as_a_broken_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     needs_packages(*NEURAL_PACKAGES)
     monkeypatch.setattr(voice, "_IMPORT_LIMIT_S", 0.2)
     (tmp_path / "onnxruntime.py").write_text("import time\ntime.sleep(60)\n")
-    found = _found(None, {**os.environ, "PYTHONPATH": str(tmp_path)}, 5.0)["neural"]
-    assert (found.state, found.next) == (WARNING, "run talk doctor again when this machine is less busy")
+    finding = _found(None, {**os.environ, "PYTHONPATH": str(tmp_path)}, 5.0)["neural"]
+    assert (finding.state, finding.next) == (WARNING, "run talk doctor again when this machine is less busy")
 
 
 def test_the_servers_voice_is_tried_in_the_servers_environment(alone: dict[str, str]) -> None:
     silent = {name: value for name, value in alone.items() if name != "TALK_PLAYER"}
     with serving(silent, "--voice", "piper/ti"), Client(alone["TALK_SOCKET"]) as client:
-        limit = time.monotonic() + LIMIT
+        limit = time.monotonic() + LIMIT_S
         while not re.search("loaded", str(client.status().server["neural_voices"])):
             assert time.monotonic() < limit
             time.sleep(0.02)
-        # The directory of the voices is in the server's environment alone.
-        found = doctor({name: value for name, value in silent.items() if name != "TALK_VOICES"}, "--silent")
-    assert re.match(f"piper/tiny {TRIED}", found["neural voice"]["message"]), found
+        # Only the server's environment names the directory of the voices.
+        findings = doctor({name: value for name, value in silent.items() if name != "TALK_VOICES"}, "--silent")
+    assert re.match(f"piper/tiny {TRIED}", findings["neural voice"]["message"]), findings
 
 
-# Whether and how the doctor looks
+# Which voice is tried
 
 
 HERE, SERVED = UserSession(0, "root"), UserSession(0, "root", server_pid=7)
@@ -161,7 +161,7 @@ UNKNOWN = EngineReport(reason="unknown_voice", message="x")
 
 
 def started(voice: str | None = None, *voices: str, driver: str = "espeak") -> EngineReport:
-    """Return the report of an engine; `voice`: the neural voice in its settings, `voices`: all of its voices."""
+    """Return the report of an engine. `voice` is the neural voice in its settings, and `voices` are all its voices."""
     return EngineReport(Ready(driver, None, None, voice), voices)
 
 
@@ -170,26 +170,26 @@ ESPEAK = started()
 
 def test_only_the_voice_in_use_is_tried(home: str, monkeypatch: pytest.MonkeyPatch) -> None:
     tiny_voice.put(Path(home) / "v", "tiny")
-    asked: list[str | None] = []
+    tried_voices: list[str | None] = []
 
     def check_neural(used: str | None, *_: object) -> list[Finding]:
-        asked.append(used)
+        tried_voices.append(used)
         return []
 
     monkeypatch.setattr(voice, "check_neural", check_neural)
 
-    def tried(used: str | None, engine: EngineReport, here: UserSession = HERE, **told: object) -> list[str | None]:
-        env = {"TALK_VOICES": f"{home}/v"} if told.pop("installed", False) else {}
+    def tried(used: str | None, engine: EngineReport, user: UserSession = HERE, **server: object) -> list[str | None]:
+        env = {"TALK_VOICES": f"{home}/v"} if server.pop("installed", False) else {}
         examination = examine.LocalExamination(None, silent=True)
-        if told:
-            examination._client, examination._server = cast("Client", object()), {"voice": used, **told}
+        if server:
+            examination._client, examination._server = cast("Client", object()), {"voice": used, **server}
         else:
             monkeypatch.setenv("TALK_VOICE", used or "")
-        examination._engine, examination._session, examination._env = engine, here, env
-        asked.clear()
-        found = list(examination._check_neural())
-        assert not found or found[0].message == "the server's neural voices: piper/a"
-        return [*asked]
+        examination._engine, examination._session, examination._env = engine, user, env
+        tried_voices.clear()
+        findings = list(examination._check_neural())
+        assert not findings or findings[0].message == "the server's neural voices: piper/a"
+        return [*tried_voices]
 
     assert tried(None, ESPEAK) == tried("de", ESPEAK) == []
     assert tried("piper/ti", started(driver="dummy"), driver="dummy") == []
@@ -199,7 +199,7 @@ def test_only_the_voice_in_use_is_tried(home: str, monkeypatch: pytest.MonkeyPat
     assert tried("tiny", UNKNOWN, installed=True) == ["tiny"]
     assert tried("none", UNKNOWN, installed=True) == [None]
     voices = {"piper/a": {"state": "loaded"}}
-    assert tried(None, ESPEAK, neural_voices=voices) == [], "the files of the server can't be seen"
+    assert tried(None, ESPEAK, neural_voices=voices) == [], "the server's files can't be examined"
     assert tried(None, ESPEAK, SERVED, neural_voices=voices) == [None]
 
 
@@ -216,12 +216,12 @@ assert not {"onnxruntime", "numpy"} & {*sys.modules}, sys.modules.keys()
     subprocess.run([sys.executable, "-c", code], env=env, check=True, timeout=60)
 
 
-# How a voice is tried
+# The trial of a voice
 
 
 def test_the_trial_of_a_slow_voice_is_aborted(alone: dict[str, str]) -> None:
-    found = _found("piper/tiny", alone, 0.01)["neural voice"]
-    assert found.message == "piper/tiny is in use: loading and speaking took more than 0.01 s"
+    finding = _found("piper/tiny", alone, 0.01)["neural voice"]
+    assert finding.message == "piper/tiny is in use: loading and speaking took more than 0.01 s"
 
 
 def test_a_voice_that_crashes_the_engine_process_is_reported(home: str, tmp_path: Path) -> None:
@@ -240,30 +240,31 @@ def test_a_signal_ends_the_trial(alone: dict[str, str]) -> None:
     options = EngineOptions(env=alone, interrupt={readable: 1})
     try:
         with pytest.raises(Interrupted):
-            list(voice.check_neural("piper/tiny", options, LIMIT, None))
+            list(voice.check_neural("piper/tiny", options, LIMIT_S, None))
     finally:
         os.close(readable)
         os.close(writable)
 
 
-# Judgements
+# Findings
 
 
-FAILED_THEN = {"piper/a": {"state": "loaded", "why": None}, "piper/b": {"state": "failed", "why": "x is no model"}}
+SERVER_VOICES = {"piper/a": {"state": "loaded", "why": None}, "piper/b": {"state": "failed", "why": "x is no model"}}
 
 
 def test_the_servers_status_is_reported_if_voices_cannot_be_examined() -> None:
-    (found,) = voice.judge_server_voices(FAILED_THEN)
-    assert (found.state, found.message) == (WARNING, "the server cannot speak with the voice piper/b: x is no model")
-    assert found.next == "check whether this is still true: talk set --voice piper/b"
-    (found,) = voice.judge_server_voices({"piper/a": FAILED_THEN["piper/a"]})
-    assert (found.state, found.message) == (OK, "the server's neural voices: piper/a")
+    (finding,) = voice.judge_server_voices(SERVER_VOICES)
+    assert finding.state == WARNING
+    assert finding.message == "the server cannot speak with the voice piper/b: x is no model"
+    assert finding.next == "try to load the voice again: talk set --voice piper/b"
+    (finding,) = voice.judge_server_voices({"piper/a": SERVER_VOICES["piper/a"]})
+    assert (finding.state, finding.message) == (OK, "the server's neural voices: piper/a")
     assert voice.judge_server_voices({}) == []
 
 
 def test_a_voice_that_fails_only_on_the_server_is_a_warning() -> None:
     trial = VoiceTrial(load_s=0.5, speed=9.0)
-    assert voice.judge_trial("piper/b", trial, FAILED_THEN).state == WARNING
+    assert voice.judge_trial("piper/b", trial, SERVER_VOICES).state == WARNING
     assert voice.judge_trial("piper/b", trial, {}).state == OK
 
 
@@ -290,7 +291,7 @@ def test_a_failed_voice_is_a_warning_if_the_server_falls_back_to_espeak(
     trial = VoiceTrial(fault=("x is no model", "download it again"))
 
     def packages(used: str | None, server_voices: dict[str, object] | None) -> str:
-        return next(voice.check_neural(used, EngineOptions(env={}), LIMIT, server_voices)).state
+        return next(voice.check_neural(used, EngineOptions(env={}), LIMIT_S, server_voices)).state
 
     for server_voices, state in ((None, FAILURE), ({}, WARNING)):
         assert voice.judge_trial("piper/a", trial, server_voices).state == state
@@ -299,6 +300,6 @@ def test_a_failed_voice_is_a_warning_if_the_server_falls_back_to_espeak(
 
 
 def test_a_missing_package_is_reported_with_its_install_command() -> None:
-    words = f"the voice piper/a cannot be loaded: numpy is missing; install it with: {install.neural()}"
-    found = voice.judge_engine("2.99", EngineReport(reason="unknown_voice", message=words), server=None)[-1]
-    assert (found.check, found.next) == ("voices", install.neural())
+    message = f"the voice piper/a cannot be loaded: numpy is missing; install it with: {install.neural()}"
+    finding = voice.judge_engine("2.99", EngineReport(reason="unknown_voice", message=message), server=None)[-1]
+    assert (finding.check, finding.next) == ("voices", install.neural())

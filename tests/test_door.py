@@ -1,7 +1,7 @@
-"""Clients come and go.
+"""Admission of clients.
 
 A full server admits waiting clients when others leave, and refuses them only if no place becomes free. A server that
-ends answers what clients have sent.
+ends answers all requests that it has received.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ URGENT = b'{"request": "hello", "urgent": true}\n'
 class Client:
     """The client's end of a connection. The server runs in the same process."""
 
-    def __init__(self, says: bytes = b"") -> None:
-        self.theirs, self.socket = socket.socketpair()
-        for each in (self.theirs, self.socket):
-            each.setblocking(False)
-        self.socket.sendall(says)
+    def __init__(self, first_bytes: bytes = b"") -> None:
+        self.server_end, self.socket = socket.socketpair()
+        for end in (self.server_end, self.socket):
+            end.setblocking(False)
+        self.socket.sendall(first_bytes)
 
     def heard(self) -> list[str]:
         """Return one word for each received line."""
-        told = b""
+        received = b""
         with contextlib.suppress(BlockingIOError):
             while data := self.socket.recv(65536):
-                told += data
-        return [_word(json.loads(line)) for line in told.splitlines()]
+                received += data
+        return [_word(json.loads(line)) for line in received.splitlines()]
 
 
 class Unused:
-    """A placeholder for the listener. These clients already have connected sockets."""
+    """A placeholder for the listener, because these clients already have connected sockets."""
 
     path, mode = "unused", 0o600
 
@@ -55,21 +55,21 @@ def _word(line: dict[str, Any]) -> str:
 
 @contextlib.contextmanager
 def server_for(clients: int) -> Iterator[Callable[[bytes], Client]]:
-    """Return a function that connects a client, after its first words, to a server with so many places."""
+    """Return a function that connects a client to a server with this number of places."""
     served = Server(ServerSettings(max_clients=clients), cast("Any", Unused()))
     made: list[Client] = []
 
-    def connect(says: bytes = b"") -> Client:
-        client = Client(says)
+    def connect(first_bytes: bytes = b"") -> Client:
+        client = Client(first_bytes)
         made.append(client)
-        ClientConnection(served, served.speech.streams, client.theirs).begin()
+        ClientConnection(served, served.speech.streams, client.server_end).begin()
         return client
 
     try:
         yield connect
     finally:
-        for each in list(served.connections):
-            each.stream.abort()
+        for connection in list(served.connections):
+            connection.stream.abort()
         for client in made:
             client.socket.close()
 
@@ -84,15 +84,15 @@ async def test_a_waiting_client_is_admitted_when_another_leaves() -> None:
     with server_for(1) as connect:
         first, second, third = connect(b""), connect(b""), connect(b"")
         await turns()
-        assert [each.heard() for each in (first, second, third)] == [["greeting"], [], []]
+        assert [client.heard() for client in (first, second, third)] == [["greeting"], [], []]
         first.socket.close()
         await turns()
-        assert sorted(each.heard() for each in (second, third)) == [[], ["greeting"]]
+        assert sorted(client.heard() for client in (second, third)) == [[], ["greeting"]]
     with server_for(1) as connect:
         first = connect(HELLO)
         await turns()
         first.socket.close()
-        second = connect(HELLO)  # the server has not read anything since then
+        second = connect(HELLO)  # the server has read nothing since then
         await turns()
         assert second.heard() == ["greeting", "True"]
     await turns()
@@ -113,13 +113,13 @@ async def test_a_full_server_admits_urgent_clients_and_lets_silent_ones_wait() -
 
 
 @in_loop
-async def test_a_server_that_ends_first_answers_all_received_requests() -> None:
+async def test_a_server_answers_all_received_requests_before_it_ends() -> None:
     served, count = Server(ServerSettings(), cast("Any", Unused())), 3 * LINES_PER_TURN
     client, idle = Client(SAY * count + STATUS), Client()
-    for each in (client, idle):
-        ClientConnection(served, served.speech.streams, each.theirs).begin()
+    for end in (client, idle):
+        ClientConnection(served, served.speech.streams, end.server_end).begin()
     await served._close_connections()
     assert client.heard() == ["greeting", *["True"] * count, *["goal"] * count, "True"]
-    for each in (client, idle):
-        assert each.theirs.fileno() == -1
-        each.socket.close()
+    for end in (client, idle):
+        assert end.server_end.fileno() == -1
+        end.socket.close()

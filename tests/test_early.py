@@ -1,4 +1,4 @@
-"""A request is sent once, before the rest of the client is imported, and its goal is cancelled with the client."""
+"""Early requests: a client sends its request once, before most of its imports. A signal still cancels the goal."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 
 
 def start(path: str) -> subprocess.Popen[str]:
-    """Start `talk say --wait hello` with the server at this place."""
+    """Start `talk say --wait hello` with the server at this path."""
     env = clean_environment(os.path.dirname(path), {"TALK_SOCKET": path})
-    words = [*TALK, "say", "--wait", "hello"]
-    return subprocess.Popen(words, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    command = [*TALK, "say", "--wait", "hello"]
+    return subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 @contextlib.contextmanager
@@ -50,10 +50,10 @@ def listening_at(path: str, backlog: int = 8) -> Iterator[socket.socket]:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_a_signal_during_the_imports_cancels_the_sent_goal(number: signal.Signals) -> None:
     def play(peer: Peer) -> None:
-        asked = peer.receive("say")
-        # At this moment the client has sent its request, and has most of its modules still to import.
+        request = peer.receive("say")
+        # The client has sent its request, but hasn't imported most of its modules yet.
         client.send_signal(number)
-        peer.send({"seq": asked["seq"], "ok": True, "goal": goal("PENDING")})
+        peer.send({"seq": request["seq"], "ok": True, "goal": goal("PENDING")})
         peer.reply("cancel")
         peer.send(result("RECALLED"))
 
@@ -63,23 +63,23 @@ def test_a_signal_during_the_imports_cancels_the_sent_goal(number: signal.Signal
     assert (client.returncode, out) == (128 + number, "g\n"), err
 
 
-def assert_hello_is_sent_once(serve: Callable[[socket.socket], None], said: list[dict[str, Any]]) -> None:
-    """Run `talk say hello` with this server, which appends the requests that it gets to `said`."""
+def assert_hello_is_sent_once(serve: Callable[[socket.socket], None], requests: list[dict[str, Any]]) -> None:
+    """Run `talk say hello` with this server, which appends the received requests to `requests`."""
     with short_directory() as directory, listening_at(f"{directory}/s") as listening:
         thread = threading.Thread(target=serve, args=[listening], daemon=True)
         thread.start()
         done = run([*TALK, "say", "hello"], clean_environment(directory, {"TALK_SOCKET": f"{directory}/s"}))
         thread.join(PATIENCE)
     assert (done.code, done.out, done.err) == (0, "g\n", "")
-    assert said == [{"request": "hello"}, {"seq": 1, "request": "say", "text": "hello"}]
+    assert requests == [{"request": "hello"}, {"seq": 1, "request": "say", "text": "hello"}]
 
 
-def answer(connected: socket.socket, said: list[dict[str, Any]]) -> None:
+def answer(connected: socket.socket, requests: list[dict[str, Any]]) -> None:
     """Read two requests, accept the goal, and read until the client hangs up."""
     with connected.makefile("rb") as file:
-        said.extend(json.loads(file.readline()) for _ in range(2))
-        connected.sendall(json.dumps({"seq": said[1]["seq"], "ok": True, "goal": goal("PENDING")}).encode() + b"\n")
-        said.extend(json.loads(each) for each in file)
+        requests.extend(json.loads(file.readline()) for _ in range(2))
+        connected.sendall(json.dumps({"seq": requests[1]["seq"], "ok": True, "goal": goal("PENDING")}).encode() + b"\n")
+        requests.extend(json.loads(line) for line in file)
 
 
 @pytest.mark.parametrize(
@@ -91,20 +91,20 @@ def answer(connected: socket.socket, said: list[dict[str, Any]]) -> None:
         [GREETING.replace(b'{"talk": 1,', b'{ "talk":1,')],
         [GREETING[:-1] + b"\n" + b'{"event": "alive"}\n'],
     ],
-    ids=["at once", "in parts", "late", "written otherwise", "with more"],
+    ids=["at once", "in parts", "late", "other spacing", "with an event"],
 )
 def test_a_request_is_sent_once_however_the_server_greets(greeting: list[bytes]) -> None:
-    said: list[dict[str, Any]] = []
+    requests: list[dict[str, Any]] = []
 
     def serve(listening: socket.socket) -> None:
         connected, _ = listening.accept()
         with connected:
             for part in greeting:
                 connected.sendall(part)
-                time.sleep(0.3 if part is not greeting[-1] else 0)  # longer than a client waits before it imports all
-            answer(connected, said)
+                time.sleep(0.3 if part is not greeting[-1] else 0)  # longer than a client waits before its imports
+            answer(connected, requests)
 
-    assert_hello_is_sent_once(serve, said)
+    assert_hello_is_sent_once(serve, requests)
 
 
 def test_nothing_is_sent_to_a_server_that_lacks_a_feature() -> None:
@@ -116,41 +116,41 @@ def test_nothing_is_sent_to_a_server_that_lacks_a_feature() -> None:
 
 
 def test_a_request_is_sent_again_if_the_server_hangs_up() -> None:
-    """As if the server ended, and a socket unit started the next one."""
-    said: list[dict[str, Any]] = []
+    """For example if the server ended, and a socket unit started the next one."""
+    requests: list[dict[str, Any]] = []
 
     def serve(listening: socket.socket) -> None:
         connected, _ = listening.accept()
         with connected:
-            connected.recv(1, socket.MSG_PEEK)  # unread when it is closed, which breaks the connection
+            connected.recv(1, socket.MSG_PEEK)  # closing a socket with unread bytes breaks the connection
         connected, _ = listening.accept()
         with connected:
             connected.sendall(GREETING)
-            answer(connected, said)
+            answer(connected, requests)
 
-    assert_hello_is_sent_once(serve, said)
+    assert_hello_is_sent_once(serve, requests)
 
 
 def test_the_request_is_sent_before_the_client_is_imported(scripted: Talk) -> None:
-    """These imports would delay the first word."""
+    """The imports would delay the first word."""
     code = (
         "import sys\n"
         "from talkcli.client import connect\n"
         "send_early = connect.send_early\n"
         "def spy(*arguments):\n"
-        "    found = send_early(*arguments)\n"
-        "    assert found and found.request_sent\n"
+        "    attempt = send_early(*arguments)\n"
+        "    assert attempt and attempt.request_sent\n"
         "    heavy = {{'click', 'json', 're', 'enum', 'socket', 'typing', 'talkcli.client.client'}}\n"
         "    print(sorted(heavy & {{*sys.modules}}))\n"
-        "    return found\n"
+        "    return attempt\n"
         "connect.send_early = spy\n"
         "from talkcli.cli import run\n"
         "assert run({}) == 0\n"
         "print('click' in sys.modules)\n"
     )
-    for words in (["say", "--wait", "length=0"], ["status"], ["cancel"], ["pause"]):
-        done = run([sys.executable, "-c", code.format(words)], scripted.env)
-        assert [done.out.splitlines()[each] for each in (0, -1) if done.out] == ["[]", "False"], done
+    for arguments in (["say", "--wait", "length=0"], ["status"], ["cancel"], ["pause"]):
+        done = run([sys.executable, "-c", code.format(arguments)], scripted.env)
+        assert [done.out.splitlines()[index] for index in (0, -1) if done.out] == ["[]", "False"], done
 
 
 def test_a_waiting_client_delays_its_imports(scripted: Talk) -> None:
@@ -166,42 +166,42 @@ def test_a_waiting_client_delays_its_imports(scripted: Talk) -> None:
         "from talkcli.cli import run\n"
         "assert run({}) == 0\n"
     )
-    for words, stands_back in (
+    for arguments, stands_back in (
         (["say", "--wait", "-q", "length=0.3"], True),
         (["say", "--wait", "--feedback", "-q", "length=0.3"], False),
         (["say", "-q", "length=0.3"], False),
         (["status", "-q"], False),
     ):
-        done = run([sys.executable, "-c", code.format(words)], scripted.env)
-        assert ("stood back set()" in done.out.splitlines()) == stands_back, (words, done)
+        done = run([sys.executable, "-c", code.format(arguments)], scripted.env)
+        assert ("stood back set()" in done.out.splitlines()) == stands_back, (arguments, done)
 
 
 def test_a_client_yields_the_processor_and_loses_no_reply(monkeypatch: pytest.MonkeyPatch) -> None:
-    ours, theirs = socket.socketpair()
-    attempt = ConnectionAttempt(ours, "s", hello_sent=True, request_sent=b"request\n")
-    with ours, theirs:
+    client_end, server_end = socket.socketpair()
+    attempt = ConnectionAttempt(client_end, "s", hello_sent=True, request_sent=b"request\n")
+    with client_end, server_end:
         for answer in (b"", b"reply\n"):
-            theirs.sendall(answer)
+            server_end.sendall(answer)
             monkeypatch.setattr("talkcli.client.connect.time.process_time", lambda: 0.1)
-            began = time.monotonic()
+            started_at = time.monotonic()
             yield_processor(attempt, None)
-            assert time.monotonic() - began >= 0.1
+            assert time.monotonic() - started_at >= 0.1
             monkeypatch.setattr("talkcli.client.connect.time.process_time", lambda: PATIENCE)
-            began = time.monotonic()
-            yield_processor(attempt, 0.05)  # its own limit comes first
-            yield_processor(attempt, None)  # and a slow machine's client waits for a moment only
-            assert time.monotonic() - began < PATIENCE
+            started_at = time.monotonic()
+            yield_processor(attempt, 0.05)  # its own limit is shorter
+            yield_processor(attempt, None)  # on a slow machine, the wait has a maximum
+            assert time.monotonic() - started_at < PATIENCE
         monkeypatch.setattr("talkcli.client.connect._LONGEST_YIELD_S", PATIENCE)
-        assert ours.recv(100) == b"reply\n"
-        began = time.monotonic()
+        assert client_end.recv(100) == b"reply\n"
+        started_at = time.monotonic()
         for refused in (b'{"seq": 1, "ok": false}\n', b'{"goal": {"state": "REJECTED"}}\n'):
-            theirs.sendall(refused)
-            yield_processor(attempt, None)  # there is nothing to wait for
-            assert (os.get_blocking(ours.fileno()), ours.recv(100)) == (False, refused)
-        theirs.close()
-        yield_processor(attempt, None)  # nor is there when the server is gone
-        assert time.monotonic() - began < PATIENCE
-        assert (os.get_blocking(ours.fileno()), ours.recv(1)) == (False, b"")
+            server_end.sendall(refused)
+            yield_processor(attempt, None)  # a refusal needs no wait
+            assert (os.get_blocking(client_end.fileno()), client_end.recv(100)) == (False, refused)
+        server_end.close()
+        yield_processor(attempt, None)  # the server is gone
+        assert time.monotonic() - started_at < PATIENCE
+        assert (os.get_blocking(client_end.fileno()), client_end.recv(1)) == (False, b"")
 
 
 def test_simple_commands_import_neither_click_nor_slow_modules(scripted: Talk) -> None:
@@ -209,11 +209,11 @@ def test_simple_commands_import_neither_click_nor_slow_modules(scripted: Talk) -
     heavy += ["talkcli.server", "talkcli.goals.scheduler", "talkcli.engine"]
     code = (
         "import sys; from talkcli.cli import run\n"
-        "for words in {}: assert run(words) == 0\n"
-        "print([each for each in {} if each in sys.modules])"
+        "for arguments in {}: assert run(arguments) == 0\n"
+        "print([name for name in {} if name in sys.modules])"
     )
-    words = [["say", "--wait", "length=0"], ["status"], ["cancel"], ["wait"], ["log"], ["voices"], ["set"]]
-    done = run([sys.executable, "-c", code.format([*words, ["set", "--rate", "150"]], heavy)], scripted.env)
+    commands = [["say", "--wait", "length=0"], ["status"], ["cancel"], ["wait"], ["log"], ["voices"], ["set"]]
+    done = run([sys.executable, "-c", code.format([*commands, ["set", "--rate", "150"]], heavy)], scripted.env)
     assert done.out.splitlines()[-1] == "[]", done
 
 
@@ -232,9 +232,9 @@ def test_ctrl_c_before_the_greeting_prints_no_traceback() -> None:
 def test_a_server_with_a_full_backlog_is_not_skipped() -> None:
     with short_directory() as directory, contextlib.ExitStack() as stack:
         first, second = f"{directory}/runtime/talk/talk.sock", f"{directory}/runtime-{os.getuid()}/talk/talk.sock"
-        for each in (first, second):
-            os.makedirs(os.path.dirname(each))
-            listening = stack.enter_context(listening_at(each, 0 if each == first else 8))
+        for path in (first, second):
+            os.makedirs(os.path.dirname(path))
+            listening = stack.enter_context(listening_at(path, 0 if path == first else 8))
         with contextlib.suppress(BlockingIOError):
             while True:
                 waiting = stack.enter_context(socket.socket(socket.AF_UNIX))
@@ -245,10 +245,10 @@ def test_a_server_with_a_full_backlog_is_not_skipped() -> None:
             patch.setenv("TMPDIR", directory)
             assert first in client_sockets(None)
             assert second in client_sockets(None)
-            found = reach(None)
-            assert (found.socket, found.backlog_full, found.failures[-1][0]) == (None, True, first)
+            attempt = reach(None)
+            assert (attempt.socket, attempt.backlog_full, attempt.failures[-1][0]) == (None, True, first)
         listening.setblocking(False)
-        with pytest.raises(BlockingIOError):  # no client came to the second place
+        with pytest.raises(BlockingIOError):  # no client connected to the second socket
             listening.accept()
 
 
@@ -285,14 +285,14 @@ def test_a_server_that_refuses_the_client_is_skipped(early: bool) -> None:
         os.unlink(second)
         with pytest.raises(AccessDenied, match=f"(?s)tried:\n  {first}: the server refused the connection: not you\n"):
             connect(None, hello(None, urgent=False), attempt=attempt())
-    assert set(heard) == {b'{"request": "hello"}\n'}, "what was asked is for the server that takes it"
+    assert set(heard) == {b'{"request": "hello"}\n'}, "the request is only for the server that admits the client"
 
 
-# Signals while a client waits
+# Signals during a wait
 
 
-def to_another_thread(number: signal.Signals) -> None:
-    """Have the kernel give a signal to another thread than the main one, which keeps waiting."""
+def signal_another_thread(number: signal.Signals) -> None:
+    """Send a signal to a thread other than the main thread, which keeps waiting."""
     thread = threading.Thread(target=lambda: signal.pthread_kill(threading.get_ident(), number))
     thread.start()
     thread.join()
@@ -300,15 +300,15 @@ def to_another_thread(number: signal.Signals) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_to_another_thread_ends_the_wait(number: signal.Signals) -> None:
-    began = time.monotonic()
+    started_at = time.monotonic()
     with Interrupts() as interrupts:
-        sender = threading.Timer(0.1, to_another_thread, [number])
+        sender = threading.Timer(0.1, signal_another_thread, [number])
         sender.start()
         wait_ready({}, 10, interrupts.watched)
     sender.join()
     assert interrupts.exit_code == 128 + number
-    assert time.monotonic() - began < 5
-    assert signal.set_wakeup_fd(-1) == -1  # nothing is left behind
+    assert time.monotonic() - started_at < 5
+    assert signal.set_wakeup_fd(-1) == -1  # the wake-up descriptor is removed
 
 
 def test_during_cleanup_only_a_first_signal_ends_the_wait() -> None:

@@ -1,16 +1,16 @@
-"""An idle server takes no processor time: its context switches are counted, which no other program adds to."""
+"""An idle server uses no processor time. The test counts context switches, which other programs don't affect."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from tests.support.usage import descendants
-from tests.tools.bench.machine import taken_in
+from tests.tools.bench.machine import measure_use
 
 if TYPE_CHECKING:
     from tests.conftest import MakeTalk
 
-SECONDS = 3
+MEASURED_S = 3
 
 
 def test_an_idle_server_switches_context_at_most_once_a_second(make_talk: MakeTalk) -> None:
@@ -18,5 +18,5 @@ def test_an_idle_server_switches_context_at_most_once_a_second(make_talk: MakeTa
     assert talk.run("say", "--wait", "--", "ready").code == 0
     processes = [talk.pid, *descendants(talk.pid)]
     assert len(processes) == 2, "the server, and its engine process"
-    found = taken_in(processes, SECONDS)
-    assert found.switches <= SECONDS, found
+    usage = measure_use(processes, MEASURED_S)
+    assert usage.switches <= MEASURED_S, usage

@@ -1,4 +1,4 @@
-"""The socket, the lock and the directory of a server, a socket that is passed to it, and clients of other users."""
+"""The server's socket, lock file and directory, passed sockets, and clients of other users."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ os.execv(sys.argv[2], sys.argv[2:])
 """
 
 
-def refused(home: str, *words: str, code: int = 11, **extra: str) -> str:
-    """Assert that a server does not start, and return its message."""
-    done = run([*SERVE, *words], environment(home, **extra))
+def refused(home: str, *arguments: str, code: int = 11, **extra: str) -> str:
+    """Assert that a server doesn't start, and return its error message."""
+    done = run([*SERVE, *arguments], environment(home, **extra))
     assert (done.code, done.out) == (code, ""), done
     assert "Traceback" not in done.err
     return done.err
@@ -66,16 +66,16 @@ def test_a_second_server_reports_the_current_lock_holder(home: str) -> None:
     path = f"{home}/lock"
     with open(path, "w+b", buffering=0) as file:
         file.write(f"{gone.pid}\n".encode())
-        found: list[int | None] = []
-        reader = threading.Thread(target=lambda: found.append(listener._read_holder(file.fileno())))
+        holders: list[int | None] = []
+        reader = threading.Thread(target=lambda: holders.append(listener._read_holder(file.fileno())))
         reader.start()
         reader.join(0.1)
-        assert reader.is_alive(), f"it named {found}, which has ended"
+        assert reader.is_alive(), f"it returned {holders}, which has ended"
         file.seek(0)
         file.truncate()
         file.write(f"{os.getpid()}\n".encode())
         reader.join()
-    assert found == [os.getpid()]
+    assert holders == [os.getpid()]
 
 
 def test_a_file_at_the_sockets_path_is_not_removed(home: str) -> None:
@@ -99,17 +99,17 @@ def test_a_server_that_cannot_start_leaves_no_lock_file(home: str) -> None:
     assert "can't listen at" in refused(home, "--socket", f"{home}/{'s' * (120 - len(home))}")
 
 
-@pytest.mark.parametrize("words", ["is not a regular file", "is a symbolic link", "is a hard link"])
-def test_an_unsafe_lock_file_is_reported_and_left_unchanged(home: str, words: str) -> None:
+@pytest.mark.parametrize("fault", ["is not a regular file", "is a symbolic link", "is a hard link"])
+def test_an_unsafe_lock_file_is_reported_and_left_unchanged(home: str, fault: str) -> None:
     with open(f"{home}/precious", "w", encoding="utf-8") as file:
         file.write("precious")
-    if "regular" in words:
+    if "regular" in fault:
         os.mkfifo(f"{home}/s.lock")
     else:
-        (os.symlink if "symbolic" in words else os.link)(f"{home}/precious", f"{home}/s.lock")
-    said = refused(home, "--socket", f"{home}/s")
-    assert f"the lock file {home}/s.lock {words}" in said
-    assert "remove it" in said
+        (os.symlink if "symbolic" in fault else os.link)(f"{home}/precious", f"{home}/s.lock")
+    message = refused(home, "--socket", f"{home}/s")
+    assert f"the lock file {home}/s.lock {fault}" in message
+    assert "remove it" in message
     with open(f"{home}/precious", encoding="utf-8") as file:
         assert file.read() == "precious"
     assert sorted(os.listdir(home)) == ["precious", "s.lock"]
@@ -127,9 +127,9 @@ def test_an_unsafe_directory_is_refused(home: str) -> None:
     for name, mode in (("open", 0o777), ("group", 0o770)):
         os.mkdir(f"{home}/{name}")
         os.chmod(f"{home}/{name}", mode)
-        said = refused(home, "--socket", f"{home}/{name}/s")
-        assert f"{home}/{name}" in said
-        assert "chmod go-w" in said
+        message = refused(home, "--socket", f"{home}/{name}/s")
+        assert f"{home}/{name}" in message
+        assert "chmod go-w" in message
     os.mkdir(f"{home}/real", 0o700)
     os.symlink("real", f"{home}/link")
     assert "symbolic link" in refused(home, "--socket", f"{home}/link/s")
@@ -150,20 +150,20 @@ def test_a_refused_client_of_another_user_exits_with_10(home: str) -> None:
         shutil.copytree(folder, f"{home}/lib/{package.__name__}", ignore=shutil.ignore_patterns("__pycache__"))
     subprocess.run(["chmod", "-R", "a+rX", f"{home}/lib"], check=True)
     client = ["setpriv", f"--reuid={NOBODY}", "--clear-groups", "/usr/bin/python3", "-m", "talkcli"]
-    theirs = environment(home, PYTHONPATH=f"{home}/lib", PYTHONDONTWRITEBYTECODE="1")
+    other_user = environment(home, PYTHONPATH=f"{home}/lib", PYTHONDONTWRITEBYTECODE="1")
     with serving(environment(home), "--socket", path):
-        for mode, words in ((0o600, ["status"]), (0o666, ["say", "hello"])):
+        for mode, arguments in ((0o600, ["status"]), (0o666, ["say", "hello"])):
             os.chmod(path, mode)
-            done = run([*client, "--socket", path, *words], theirs)
+            done = run([*client, "--socket", path, *arguments], other_user)
             assert (done.code, done.out) == (10, ""), done
             assert "Traceback" not in done.err
-            assert "its owner can let you in with: talk serve --socket-mode 0660" in done.err
+            assert "ask its owner to run: talk serve --socket-mode 0660" in done.err
             assert done.err.endswith("or start your own server with: talk serve\n")
-        done = run([*client, "status"], {**theirs, "TALK_SOCKET": path})
+        done = run([*client, "status"], {**other_user, "TALK_SOCKET": path})
         assert done.err.endswith("or unset TALK_SOCKET to try the usual places\n")
-        assert "talk serve\n" not in done.err, "it would listen at that place, too"
+        assert "talk serve\n" not in done.err, "a new server would use the same path"
     with serving(environment(home), "--socket", path, "--socket-mode", "0666"):
-        assert run([*client, "--socket", path, "say", "--wait", "hi"], theirs).code == 0
+        assert run([*client, "--socket", path, "say", "--wait", "hi"], other_user).code == 0
 
 
 def test_a_passed_socket_is_served_and_not_removed(home: str) -> None:

@@ -25,8 +25,8 @@ LONG = "please step back from the door and from the lift " * 5
 
 
 def numbers(ids: list[str]) -> list[str]:
-    """Return the ids of the server's goals as lists show them."""
-    return [each.partition("-")[2] for each in ids]
+    """Return the short form of goal ids that lists show."""
+    return [goal_id.partition("-")[2] for goal_id in ids]
 
 
 @pytest.fixture
@@ -48,50 +48,50 @@ def test_a_line_shows_time_state_text_sender_and_reason(scripted: Talk, history:
     done = scripted.run("log")
     assert (done.code, done.err) == (0, "")
     lines = done.out.splitlines()
-    assert [each.split()[2] for each in lines] == numbers(history)
+    assert [line.split()[2] for line in lines] == numbers(history)
     states = ["SUCCEEDED", "ABORTED", "REJECTED", "RECALLED", "PREEMPTED"]
-    assert [each.split()[1] for each in lines] == states
-    assert all(re.match(r"\d\d:\d\d:\d\d  \w", each) for each in lines)
+    assert [line.split()[1] for line in lines] == states
+    assert all(re.match(r"\d\d:\d\d:\d\d  \w", line) for line in lines)
     script = re.escape(sys.executable.split("/")[-1][:6])
     assert re.search(r'"length=0" +"patrol\\x1b\[m"$', lines[0])
     assert re.search(r" +audio_lost: no cable$", lines[1])
     assert re.search(r'"" .* +invalid_text: the text is empty$', lines[2])
     assert re.search(r'"waits" .* +canceled by \S+$', lines[3])
     long = scripted.run("log", "--long").out.splitlines()
-    assert [each.split()[2] for each in long] == history
+    assert [line.split()[2] for line in long] == history
     assert re.search(rf'"length=0" +"patrol\\x1b\[m" \(\S*{script}.*, pid \d+\)  0\.0 s$', long[0])
     assert re.search(r", pid \d+ +audio_lost: no cable$", long[1])
     assert re.search(rf'"waits" .*, pid \d+ +canceled by \S*{script}.*, pid \d+$', long[3])
     assert f'"never-ends {LONG}"' in lines[4]  # a pipe gets the whole text
     assert "\x1b" not in done.out
-    goals = [json.loads(each) for each in scripted.run("--json", "log").out.splitlines()]
-    assert [each["id"] for each in goals] == history
+    goals = [json.loads(line) for line in scripted.run("--json", "log").out.splitlines()]
+    assert [goal["id"] for goal in goals] == history
     assert goals[-1] == scripted.goal(history[-1])
 
 
 def test_log_shows_the_latest_goals_oldest_first(scripted: Talk) -> None:
     assert (scripted.run("log").out, scripted.run("log").code, scripted.run("--json", "log").out) == ("", 0, "")
     goals = [scripted.request("say", text=f"length=0 {number}", wait=True)["goal"] for number in range(22)]
-    history = [each["id"] for each in goals]
+    history = [goal["id"] for goal in goals]
     scripted.run("wait")
-    assert [each.split()[2] for each in scripted.run("log").out.splitlines()] == numbers(history[-20:])
-    assert [each.split()[2] for each in scripted.run("log", "-n", "2").out.splitlines()] == numbers(history[-2:])
-    assert [each.split()[2] for each in scripted.run("log", "--count", str(MAX_LOG_GOALS)).out.splitlines()] == numbers(
+    assert [line.split()[2] for line in scripted.run("log").out.splitlines()] == numbers(history[-20:])
+    assert [line.split()[2] for line in scripted.run("log", "-n", "2").out.splitlines()] == numbers(history[-2:])
+    assert [line.split()[2] for line in scripted.run("log", "--count", str(MAX_LOG_GOALS)).out.splitlines()] == numbers(
         history
     )
 
 
 def test_lines_are_aligned_and_fit_the_terminal(scripted: Talk, history: list[str]) -> None:
-    """Other widths are tested in `tests/unit/test_transcript.py`."""
+    """`tests/unit/test_transcript.py` tests other widths."""
     columns = 80
     env = {"TERM": "xterm", **scripted.env}
     with Terminal([*TALK, "log"], env, columns) as shown:
         assert shown.finish() == 0
         lines, coloured = shown.lines, shown.raw
-    assert [each.split()[2] for each in lines] == numbers(history)
+    assert [line.split()[2] for line in lines] == numbers(history)
     assert max(map(width, lines)) <= columns
     assert '…"' in lines[-1]
-    assert len({each.index('"') for each in lines}) == 1
+    assert len({line.index('"') for line in lines}) == 1
     assert "audio_lost"[:8] in lines[1]
     assert b"\x1b[32mSUCCEEDED\x1b[0m" in coloured
     assert b"\x1b[31mREJECTED \x1b[0m" in coloured

@@ -1,4 +1,4 @@
-"""Neural voices through a server: they are listed, loaded and spoken with, or espeak speaks; there is never silence."""
+"""Neural voices with a server. If a neural voice can't be used, espeak speaks instead."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ if TYPE_CHECKING:
     from tests.conformance.bareserve import BareServe
 
 TINY, BROKEN = "piper/tiny", "piper/broken"
-#: The voice of libespeak-ng that speaks instead of these, whose language is en-us.
+#: The espeak voice that replaces these voices, whose language is en-us.
 INSTEAD = "gmw/en-US"
 LONG = "this goes on and on " * 30
-#: Runs first in each Python process: no model is loaded while the file HOLD exists, and each may take more memory.
+#: Runs first in each Python process: models load only after the file HOLD is removed, and may take more memory.
 SITE = """
 import importlib.abc, importlib.util, os, sys, time
-class Held(importlib.abc.MetaPathFinder):
+class Delay(importlib.abc.MetaPathFinder):
     def find_spec(self, name, path=None, target=None):
         if name != "talkcli.engine.child.synthesizers.inference":
             return None
@@ -49,21 +49,21 @@ class Held(importlib.abc.MetaPathFinder):
         def executed(module):
             execute(module)
             init = module.Model.__init__
-            def held(model, path, *rest):
+            def delayed(model, path, *rest):
                 while os.path.exists(os.environ["HOLD"]):
                     time.sleep(0.01)
                 init(model, path, *rest)
                 model.ballast = b"x" * int(os.environ.get("BALLAST_BYTES", 0))
-            module.Model.__init__ = held
+            module.Model.__init__ = delayed
         spec.loader.exec_module = executed
         return spec
-sys.meta_path.insert(0, Held())
+sys.meta_path.insert(0, Delay())
 """
 
 
 @pytest.fixture
 def env(home: str, tmp_path: Path) -> dict[str, str]:
-    """Return the environment of a server with two voices."""
+    """Return the environment of a server with a working and a broken voice."""
     needs_packages(*NEURAL_PACKAGES)
     tiny_voice.put(tmp_path / "voices", "tiny")
     tiny_voice.put(tmp_path / "voices", "broken", b"no model")
@@ -80,13 +80,13 @@ def env(home: str, tmp_path: Path) -> dict[str, str]:
 
 @pytest.fixture
 def hold(tmp_path: Path) -> Path:
-    """Let no model be loaded until this file is removed."""
+    """Create the file that delays the loading of models until it is removed."""
     (tmp_path / "hold").touch()
     return tmp_path / "hold"
 
 
 class Robot:
-    """A server with neural voices, and a client of it."""
+    """A server with neural voices, and its client."""
 
     def __init__(self, server: BareServe, env: dict[str, str]) -> None:
         self.server = server
@@ -97,31 +97,30 @@ class Robot:
         return self.client.say(text, voice=voice, **options)
 
     def heard(self, goal: GoalHandle) -> tuple[str, str | None]:
-        """Return how a goal ended, and by which voice it was heard."""
+        """Return the final state of a goal, and the voice that spoke it."""
         ended = goal.wait(LIMIT)
         return ended.state.name, ended.voice
 
     def state(self, goal: GoalHandle) -> str:
-        """Return the state of a goal."""
         return self.client.goal(goal.id).state.name
 
     def neural(self, voice: str = TINY) -> dict[str, Any]:
-        """Return how the server describes a neural voice."""
-        found = self.client.status().server["neural_voices"]
-        assert isinstance(found, dict)
-        return dict(found.get(voice, {"state": None}))
+        """Return the server's description of a neural voice."""
+        voices = self.client.status().server["neural_voices"]
+        assert isinstance(voices, dict)
+        return dict(voices.get(voice, {"state": None}))
 
-    def until(self, what: Callable[[], object]) -> None:
+    def until(self, condition: Callable[[], object]) -> None:
         limit = time.monotonic() + LIMIT
-        while not what():
-            assert time.monotonic() < limit, f"it never came: {self.server.log}"
+        while not condition():
+            assert time.monotonic() < limit, f"the condition never became true: {self.server.log}"
             time.sleep(0.02)
 
     def until_crashed(self, times: int) -> None:
         """Wait until the server has logged this number of engine crashes."""
         self.until(lambda: self.server.log.count("the engine crashed") == times)
 
-    def loads(self, voice: str = TINY) -> None:
+    def until_loaded(self, voice: str = TINY) -> None:
         """Wait until a voice is loaded."""
         self.until(lambda: self.neural(voice)["state"] == "loaded")
 
@@ -138,14 +137,14 @@ def _robot(env: dict[str, str], *options: str) -> Iterator[Robot]:
             yield robot
 
 
-# -- a voice that is being loaded
+# -- voices that are being loaded
 
 
 def test_a_goal_and_those_behind_it_wait_for_its_voice(env: dict[str, str], hold: Path) -> None:
     with _robot(env) as robot:
         first, second = robot.say(), robot.say("behind", None)
         robot.until(lambda: robot.neural() == {"state": "loading", "why": None})
-        assert [robot.state(each) for each in (first, second)] == ["PENDING", "PENDING"]
+        assert [robot.state(goal) for goal in (first, second)] == ["PENDING", "PENDING"]
         assert "voice    piper/tiny loading" in run([*TALK, "status"], env).out
         hold.unlink()
         assert robot.heard(first) == ("SUCCEEDED", TINY)
@@ -174,7 +173,7 @@ def test_espeak_speaks_urgent_goals_while_their_voice_is_loading(env: dict[str, 
         for urgent in ({"preempt": True}, {"flush": True}, {"priority": 1}, {"ttl": 0.2}):
             goal = robot.say("hello", **urgent)
             assert robot.heard(goal) == ("SUCCEEDED", INSTEAD)
-            assert f"{goal.id} is spoken by {INSTEAD} instead: piper/tiny is not loaded" in robot.server.log
+            assert f"{goal.id} is spoken with the voice {INSTEAD} instead: piper/tiny is not loaded" in robot.server.log
         assert f"voice    {INSTEAD}" in run([*TALK, "status", goal.id], env).out
         late, insists = robot.say(voice_only=True, ttl=0.5), robot.say("x", voice_only=True, priority=1)
         assert late.wait(LIMIT).reason == "expired"
@@ -184,7 +183,7 @@ def test_espeak_speaks_urgent_goals_while_their_voice_is_loading(env: dict[str, 
 
 
 def test_the_first_voice_is_loaded_in_silence_and_others_during_speech(env: dict[str, str], tmp_path: Path) -> None:
-    """The libraries of the first one stop the whole process for a moment, which would be heard."""
+    """Loading the libraries for the first voice stops the process for an audible moment."""
     tiny_voice.put(tmp_path / "voices", "second")
     with _robot(env) as robot:
         active = robot.say(LONG, None)
@@ -210,7 +209,7 @@ def test_the_first_voice_is_loaded_in_silence_and_others_during_speech(env: dict
         assert robot.heard(goal) == ("SUCCEEDED", TINY)
 
 
-# -- a voice that can't be loaded
+# -- voices that can't be loaded
 
 
 def test_espeak_replaces_a_broken_voice_until_it_is_repaired(env: dict[str, str], tmp_path: Path) -> None:
@@ -219,7 +218,10 @@ def test_espeak_replaces_a_broken_voice_until_it_is_repaired(env: dict[str, str]
         assert robot.heard(robot.say("hello", None)) == ("SUCCEEDED", INSTEAD)
         assert robot.neural(BROKEN) == {"state": "failed", "why": why}
         assert f"{BROKEN} failed: " in run([*TALK, "status"], env).out
-        assert f"voice {BROKEN} can't be loaded, so espeak speaks (except with --voice-only): {why}" in robot.server.log
+        assert (
+            f"voice {BROKEN} can't be loaded, so espeak is used instead (except with --voice-only): {why}"
+            in robot.server.log
+        )
         done = run([*TALK, "--json", "say", "--wait", "--voice-only", "hello"], env)
         goal = json.loads(done.out)
         assert (done.code, goal["reason"], goal["message"]) == (4, "voice_failed", f"speech failed: {why}")
@@ -233,8 +235,8 @@ def test_two_voices_that_exceed_the_memory_limit_speak_in_turn(env: dict[str, st
     tiny_voice.put(tmp_path / "voices", "second")
     with _robot(env, "--voice-memory", "0") as robot:
         names = (TINY, "piper/second", TINY)
-        goals = [robot.say(voice=each) for each in names]
-        assert [robot.heard(each) for each in goals] == [("SUCCEEDED", each) for each in names]
+        goals = [robot.say(voice=name) for name in names]
+        assert [robot.heard(goal) for goal in goals] == [("SUCCEEDED", name) for name in names]
         assert "unloaded voice piper/tiny to make room" in robot.server.log
 
 
@@ -266,16 +268,16 @@ def test_a_pitch_is_refused_with_a_voice_of_fixed_pitch(env: dict[str, str]) -> 
         refused = robot.say(pitch=70).goal
         assert (refused.reason, refused.state.name) == ("bad_option", "REJECTED")
         assert "has a fixed pitch" in str(refused.message)
-        for options in ({}, {"pitch": 70}, {"voice_only": True}):  # the server's pitch is for other voices
+        for options in ({}, {"pitch": 70}, {"voice_only": True}):  # the server's pitch only affects other voices
             assert robot.heard(robot.say("hello", None, **options)) == ("SUCCEEDED", TINY)
 
 
-# -- an engine that dies, hangs or cannot start
+# -- engines that crash, hang or can't start
 
 
 def test_an_engine_crash_costs_one_goal_and_the_voice_is_loaded_again(env: dict[str, str]) -> None:
     with _robot(env, "--voice", TINY) as robot:
-        robot.loads()
+        robot.until_loaded()
         goal = robot.say(LONG, None)
         robot.until(lambda: robot.client.goal(goal.id).spoken)
         robot.kill_engine()
@@ -305,14 +307,14 @@ def test_a_voice_that_crashes_the_engine_twice_is_not_used(env: dict[str, str], 
 
 def test_espeak_speaks_if_the_files_of_a_voice_are_missing(env: dict[str, str], tmp_path: Path) -> None:
     with _robot(env, "--voice", TINY) as robot:
-        robot.loads()
+        robot.until_loaded()
         (tmp_path / "voices" / "tiny.onnx").unlink()
         robot.kill_engine()
         robot.until(lambda: robot.neural()["state"] == "failed")
         goal = robot.say("hello", None)
         state, voice = robot.heard(goal)
         assert state == "SUCCEEDED"
-        assert f'{goal.id} is spoken by {voice} instead: unknown voice "piper/tiny"' in robot.server.log
+        assert f'{goal.id} is spoken with the voice {voice} instead: unknown voice "piper/tiny"' in robot.server.log
 
 
 def test_goals_fail_at_once_if_the_engine_cannot_start(env: dict[str, str], tmp_path: Path) -> None:
@@ -320,7 +322,7 @@ def test_goals_fail_at_once_if_the_engine_cannot_start(env: dict[str, str], tmp_
     with _robot(env, "--voice", TINY) as robot:
         robot.until(lambda: "pyttsx3 is missing" in robot.server.log)
         goals = [robot.say("hello", None), robot.say(voice_only=True), robot.say("behind", "en")]
-        assert [each.wait(LIMIT).reason for each in goals] == ["engine_failed"] * 3
+        assert [goal.wait(LIMIT).reason for goal in goals] == ["engine_failed"] * 3
 
 
 def test_an_engine_that_hangs_while_loading_is_replaced(env: dict[str, str], hold: Path) -> None:
@@ -334,7 +336,7 @@ def test_an_engine_that_hangs_while_loading_is_replaced(env: dict[str, str], hol
         assert robot.heard(goal) == ("SUCCEEDED", TINY)
 
 
-# -- lists, files, refusals
+# -- lists, files, refused voices
 
 
 def test_gaps_on_a_slow_machine_are_reported(env: dict[str, str], tmp_path: Path) -> None:
@@ -384,30 +386,30 @@ def test_voices_are_listed_with_quality_and_speakers(env: dict[str, str], tmp_pa
     several = tiny_voice.description(speakers=2, language="de_DE")
     tiny_voice.put(tmp_path / "voices", "two", tiny_voice.model(speakers=2), several)
     with serving(env):
-        lines = [each.split(maxsplit=2) for each in run([*TALK, "voices"], env).out.splitlines()]
-        assert [each for each in lines if each[0] in {"piper/broken", "piper/tiny", "piper/two"}] == [
+        lines = [line.split(maxsplit=2) for line in run([*TALK, "voices"], env).out.splitlines()]
+        assert [line for line in lines if line[0] in {"piper/broken", "piper/tiny", "piper/two"}] == [
             ["piper/broken", "en-us", "tiny, low"],
             ["piper/tiny", "en-us", "tiny, low"],
             ["piper/two", "de-de", "tiny, low, 2 speakers"],
         ]
-        found = [json.loads(each) for each in run([*TALK, "--json", "voices"], env).out.splitlines()]
-        assert {*map(tuple, found)} == {("id", "language", "name", "quality", "speakers")}
-        more = {each["id"]: (each["quality"], each["speakers"]) for each in found}
+        voices = [json.loads(line) for line in run([*TALK, "--json", "voices"], env).out.splitlines()]
+        assert {*map(tuple, voices)} == {("id", "language", "name", "quality", "speakers")}
+        more = {voice["id"]: (voice["quality"], voice["speakers"]) for voice in voices}
         assert (more["piper/tiny"], more["piper/two"]) == (("low", None), ("low", ["p0", "p1"]))
         assert more["gmw/en-US"] == (None, None)
         listed = run([*TALK, "voices", "--language", "en"], env).out.split()
         assert listed.index("gmw/en-US") < listed.index("piper/tiny")
         assert "piper/two" not in listed
-        # A voice's own name is no language's.
+        # The name of a voice doesn't count as a language.
         done = run([*TALK, "voices", "--language", "tiny,"], env)
         assert (done.code, "'de'" in done.err, "'en'" in done.err) == (1, False, False), done
 
 
 def test_text_from_a_voices_files_is_always_escaped(env: dict[str, str], tmp_path: Path) -> None:
     evil = "\x1b]0;owned\x07\n\u202e"
-    told = tiny_voice.description(voice=evil, language=evil, speakers=2, dataset=evil * 100, speaker_id_map={evil: 0})
-    told["audio"] = {"sample_rate": 22050, "quality": evil}
-    tiny_voice.put(tmp_path / "voices", "evil", tiny_voice.model(speakers=2), told)
+    config = tiny_voice.description(voice=evil, language=evil, speakers=2, dataset=evil * 100, speaker_id_map={evil: 0})
+    config["audio"] = {"sample_rate": 22050, "quality": evil}
+    tiny_voice.put(tmp_path / "voices", "evil", tiny_voice.model(speakers=2), config)
     tiny_voice.put(tmp_path / "voices", "type", config=tiny_voice.description(phoneme_type=evil))
     with serving(env) as server:
         shown = [
@@ -419,58 +421,58 @@ def test_text_from_a_voices_files_is_always_escaped(env: dict[str, str], tmp_pat
             run([*TALK, "status"], env),
             run([*TALK, "log"], env),
         ]
-    assert any("piper/evil" in each.out for each in shown)
-    assert [each.code for each in shown[2:5]] == [4, 4, 5]
-    for text in (server.log, *(each.out + each.err for each in shown)):
+    assert any("piper/evil" in done.out for done in shown)
+    assert [done.code for done in shown[2:5]] == [4, 4, 5]
+    for text in (server.log, *(done.out + done.err for done in shown)):
         assert not {"\x1b", "\x07", "\u202e"} & {*text}, text
         assert max(map(len, text.splitlines()), default=0) < 1000
 
 
 def test_every_voice_offered_by_completion_exists(env: dict[str, str]) -> None:
     with serving(env):
-        told = [json.loads(each) for each in run([*TALK, "--json", "voices"], env).out.splitlines()]
-        found = {
-            each: [value for value, _ in offered(f"talk say --voice {each}", env)] for each in ("", "pi", "ti", "E")
+        listed = [json.loads(line) for line in run([*TALK, "--json", "voices"], env).out.splitlines()]
+        offers = {
+            typed: [value for value, _ in offered(f"talk say --voice {typed}", env)] for typed in ("", "pi", "ti", "E")
         }
-    voices = tuple(Voice(**each) for each in told)
-    for typed, values in found.items():
-        for each in values:
-            assert find_voice(each, voices) is not None, (typed, each)
-    assert {"piper/tiny", "piper/broken", "en-us"} <= {*found[""]}
-    assert {"piper/broken", "piper/tiny"} <= {*found["pi"]}
-    assert found["ti"] == []
+    voices = tuple(Voice(**fields) for fields in listed)
+    for typed, values in offers.items():
+        for value in values:
+            assert find_voice(value, voices) is not None, (typed, value)
+    assert {"piper/tiny", "piper/broken", "en-us"} <= {*offers[""]}
+    assert {"piper/broken", "piper/tiny"} <= {*offers["pi"]}
+    assert offers["ti"] == []
 
 
 def test_a_neural_voice_is_refused_with_another_driver(env: dict[str, str]) -> None:
-    words = '"piper/tiny" is a neural voice, which the driver "dummy" does not support; leave out --driver'
+    message = '"piper/tiny" is a neural voice, which the driver "dummy" does not support; leave out --driver'
     done = run([*TALK, "serve", "--driver", "dummy", "--voice", "piper/tiny"], env)
-    assert (done.code, words in done.err) == (2, True), done
+    assert (done.code, message in done.err) == (2, True), done
     with serving(env, "--driver", "dummy"):
         done = run([*TALK, "say", "--voice", "piper/tiny", "hello"], env)
-        assert (done.code, words in done.err) == (5, True), done
+        assert (done.code, message in done.err) == (5, True), done
         done = run([*TALK, "set", "--voice", "piper/tiny"], env)
-        assert (done.code, words in done.err) == (2, True), done
+        assert (done.code, message in done.err) == (2, True), done
 
 
 def test_without_the_extra_neural_voices_are_listed_but_refused(env: dict[str, str], tmp_path: Path) -> None:
     (tmp_path / "site" / "sitecustomize.py").write_text(WITHOUT.format(names=["onnxruntime"]))
     bare = {**env, "PYTHONPATH": str(tmp_path / "site")}
-    words = f"onnxruntime is missing; install it with: {install.neural()}"
+    message = f"onnxruntime is missing; install it with: {install.neural()}"
     done = run([*TALK, "serve", "--player", "null", "--voice", "piper/tiny"], bare)
-    assert (done.code, words in done.err) == (2, True), done
+    assert (done.code, message in done.err) == (2, True), done
     with serving(bare):
         assert "piper/tiny" in run([*TALK, "voices"], env).out
         done = run([*TALK, "--json", "say", "--voice", "piper/tiny", "hello"], env)
         goal = json.loads(done.out)
         assert (done.code, goal["state"], goal["reason"]) == (5, "REJECTED", "unknown_voice")
-        assert words in goal["message"]
+        assert message in goal["message"]
         done = run([*TALK, "set", "--voice", "piper/tiny"], env)
-        assert (done.code, words in done.err) == (2, True), done
+        assert (done.code, message in done.err) == (2, True), done
         assert run([*TALK, "say", "--wait", "hello"], env).code == 0
 
 
 def heard(env: dict[str, str], *options: str) -> object:
-    """Return the voice by which a sentence was heard."""
+    """Return the voice that spoke a sentence."""
     return json.loads(run([*TALK, "--json", "say", "--wait", *options, "hello"], env).out)["voice"]
 
 
@@ -479,37 +481,37 @@ def test_a_drivers_voice_precedes_a_neural_voice_of_the_same_name(env: dict[str,
     with serving(env, "--rate", "450", "--voice", "en"):
         assert heard(env) == "gmw/en"
         assert run([*TALK, "set", "--voice", "tiny"], env).code == 0
-        found = [heard(env, "--voice-only", "--voice", each) for each in ("en-us", "EN", "gmw/en-US")]
-        assert found == ["piper/tiny", "piper/tiny", "gmw/en-US"], "the language of a neural voice means that voice"
+        used = [heard(env, "--voice-only", "--voice", voice) for voice in ("en-us", "EN", "gmw/en-US")]
+        assert used == ["piper/tiny", "piper/tiny", "gmw/en-US"], "the language of a neural voice selects that voice"
 
 
 def test_an_unknown_voice_or_speaker_is_refused(env: dict[str, str], tmp_path: Path) -> None:
     several = tiny_voice.description(speakers=2)
     tiny_voice.put(tmp_path / "voices", "two", tiny_voice.model(speakers=2), several)
     with serving(env, "--rate", "450"):
-        for voice, words in (
+        for voice, message in (
             ("piper/tiny#1", 'no speaker "1"; the voice has one speaker'),
             ("piper/two#2", 'no speaker "2"; the voice has 2 speakers, 0 to 1'),
             ("piper/two#nobody", 'no speaker "nobody"'),
         ):
             done = run([*TALK, "say", "--voice", voice, "hello"], env)
-            assert (done.code, words in done.err) == (5, True), done
+            assert (done.code, message in done.err) == (5, True), done
         for voice in ("piper/tiny#0", "piper/two#1", "piper/two#p1"):
             assert heard(env, "--voice-only", "--voice", voice) == voice
-    for voice, words in (("piper/tiny#4", "the voice has one speaker"), ("piper/none", 'unknown voice "piper/none"')):
+    for voice, message in (("piper/tiny#4", "the voice has one speaker"), ("piper/none", 'unknown voice "piper/none"')):
         done = run([*TALK, "serve", "--player", "null", "--voice", voice], env)
-        assert (done.code, words in done.err) == (2, True), done
+        assert (done.code, message in done.err) == (2, True), done
 
 
-#: System calls that change a file or use the internet, even if they failed.
-_REPORTS = re.compile(
+#: System calls that change a file or use the internet, successful or not.
+_SIDE_EFFECTS = re.compile(
     r"AF_INET|O_WRONLY|O_RDWR|O_CREAT|\b(mkdir|mknod|rename|unlink|link|symlink|chmod|chown|truncate)\w*\("
 )
 
 
 @pytest.mark.parametrize("seconds", [0, pytest.param(30, marks=pytest.mark.slow)])
 def test_a_neural_voice_contacts_no_host_and_changes_no_file(env: dict[str, str], tmp_path: Path, seconds: int) -> None:
-    """Even if the user has turned on onnxruntime's telemetry, which asks for its host 9 seconds after the import."""
+    """Even if the user enables onnxruntime's telemetry, which looks up its host 9 seconds after the import."""
     needs("strace")
     trace = tmp_path / "trace"
     traced = ["strace", "-f", "-y", "-s", "4096", "-e", "trace=%network,%file", "-o", str(trace), *SERVE]
@@ -521,10 +523,10 @@ def test_a_neural_voice_contacts_no_host_and_changes_no_file(env: dict[str, str]
             assert done.code == 0, done
             time.sleep(seconds)
         finally:
-            os.kill(talk, signal.SIGTERM)  # strace itself passes no signal on
+            os.kill(talk, signal.SIGTERM)  # strace doesn't forward signals
             server.process.wait(LIMIT)
     lines = trace.read_text(errors="replace").splitlines()
-    assert any("onnxruntime" in each for each in lines)
+    assert any("onnxruntime" in line for line in lines)
     home = env["HOME"]
     own = (f'"{home}"', f'"{home}/s', f'"{home}/.cache"', f'"{home}/.cache/talk', '"/dev/null"')
-    assert [each for each in lines if _REPORTS.search(each) and not any(place in each for place in own)] == []
+    assert [line for line in lines if _SIDE_EFFECTS.search(line) and not any(place in line for place in own)] == []

@@ -1,4 +1,4 @@
-"""Standard output that is closed or full: the exit code says so, without a traceback, and nothing is spoken twice."""
+"""Closed or full standard output: the exit code reports it, without a traceback, and goals are spoken once."""
 
 from __future__ import annotations
 
@@ -41,35 +41,35 @@ def bash(talk: Talk, script: str) -> subprocess.CompletedProcess[str]:
     return done
 
 
-def to(talk: Talk, output: int | str, *words: str, stdin: str | None = None) -> tuple[int, str]:
-    """Run `talk` with this file as its output; return its exit code and its notes."""
+def run_to(talk: Talk, output: int | str, *arguments: str, stdin: str | None = None) -> tuple[int, str]:
+    """Run `talk` with this file as its output, and return its exit code and its standard error."""
     descriptor = os.open(output, os.O_WRONLY) if isinstance(output, str) else output
     source = subprocess.DEVNULL if stdin is None else subprocess.PIPE
-    client = Forked(words, talk.env, stdin=source, stdout=descriptor, stderr=subprocess.PIPE)
+    client = Forked(arguments, talk.env, stdin=source, stdout=descriptor, stderr=subprocess.PIPE)
     os.close(descriptor)
     err = client.communicate(stdin, timeout=20)[1]
     assert "Traceback" not in err
     return client.wait(), err
 
 
-def unread(talk: Talk, *words: str) -> tuple[int, str]:
-    """Run `talk` with its output in a pipe whose reader has gone; return its exit code and its notes."""
+def unread(talk: Talk, *command: str) -> tuple[int, str]:
+    """Run `talk` with a closed pipe as its output, and return its exit code and its standard error."""
     reader, writer = os.pipe()
     os.close(reader)
-    return to(talk, writer, *words)
+    return run_to(talk, writer, *command)
 
 
-# A command that prints
+# Commands that print
 
 
 def test_a_command_whose_reader_has_gone_exits_with_141(scripted: Talk) -> None:
     scripted.run("say", "--wait", "length=0")
-    for words in (["status"], ["--json", "status"], ["voices"], ["--json", "voices"], ["log"], ["set"], ["--help"]):
-        assert unread(scripted, *words) == (CLOSED, ""), words
+    for arguments in (["status"], ["--json", "status"], ["voices"], ["--json", "voices"], ["log"], ["set"], ["--help"]):
+        assert unread(scripted, *arguments) == (CLOSED, ""), arguments
     done = bash(scripted, "talk status | head -n 1; echo ${PIPESTATUS[0]}")
     first, code = done.stdout.splitlines()
     assert (first.startswith("server   pid "), done.stderr) == (True, "")
-    assert code in {"0", str(CLOSED)}  # the rest may have been written before the reader was gone
+    assert code in {"0", str(CLOSED)}  # talk may have written everything before the reader left
 
 
 @pytest.mark.parametrize("closed", [">&-", "1</dev/null"])
@@ -80,42 +80,42 @@ def test_a_command_with_a_closed_output_exits_with_141(scripted: Talk, closed: s
 
 @pytest.mark.parametrize("command", ["status", "--json status", "say -w length=0", "voices"])
 def test_a_full_disk_is_reported_with_a_readable_message(scripted: Talk, command: str) -> None:
-    assert to(scripted, "/dev/full", *command.split()) == (1, FULL)
+    assert run_to(scripted, "/dev/full", *command.split()) == (1, FULL)
 
 
 def test_an_io_error_is_not_mistaken_for_a_closed_reader(scripted: Talk) -> None:
-    with open("/proc/self/mem", "r+b") as broken:  # nothing can be written at 0
-        found = to(scripted, os.dup(broken.fileno()), "status")
-    assert found == (1, "talk: can't write to standard output: Input/output error\n")
+    with open("/proc/self/mem", "r+b") as broken:  # nothing can be written to address 0
+        result = run_to(scripted, os.dup(broken.fileno()), "status")
+    assert result == (1, "talk: can't write to standard output: Input/output error\n")
 
 
 def test_a_closed_standard_error_changes_no_exit_code(scripted: Talk) -> None:
     done = bash(scripted, "talk status 4k7f-99 2>&-; echo $?; talk say -w fail=audio_lost 2>&-; echo $?")
-    assert [each for each in done.stdout.splitlines() if "-" not in each] == ["8", "4"]
+    assert [line for line in done.stdout.splitlines() if "-" not in line] == ["8", "4"]
 
 
-# A goal whose output cannot be written from the start
+# Output that can't be written from the start
 
 
 def test_a_goal_is_spoken_even_if_its_id_cannot_be_printed(scripted: Talk) -> None:
     bash(scripted, "talk say length=0 >&-")
-    to(scripted, "/dev/full", "say", "length=0")
+    run_to(scripted, "/dev/full", "say", "length=0")
     unread(scripted, "say", "length=0")
-    assert [scripted.watcher.wait_for_terminal(each) for each in scripted.watcher.goals()] == ["SUCCEEDED"] * 3
+    assert [scripted.watcher.wait_for_terminal(goal) for goal in scripted.watcher.goals()] == ["SUCCEEDED"] * 3
 
 
-@pytest.mark.parametrize("words", ["say", "say -w", "--json say -wf", "say -wq"])
-def test_say_waits_even_if_its_output_was_closed_from_the_start(scripted: Talk, words: str) -> None:
-    for closed in [">&-", "1</dev/null"] if words in {"say -w", "--json say -wf"} else []:
-        done = bash(scripted, f"(talk {words} length=0.2; echo $? >&2) {closed}")
+@pytest.mark.parametrize("arguments", ["say", "say -w", "--json say -wf", "say -wq"])
+def test_say_waits_even_if_its_output_was_closed_from_the_start(scripted: Talk, arguments: str) -> None:
+    for closed in [">&-", "1</dev/null"] if arguments in {"say -w", "--json say -wf"} else []:
+        done = bash(scripted, f"(talk {arguments} length=0.2; echo $? >&2) {closed}")
         assert (done.stdout, done.stderr) == ("", "0\n")
-    assert unread(scripted, *words.split(), "length=0.2") == (0, "")
+    assert unread(scripted, *arguments.split(), "length=0.2") == (0, "")
     for goal in scripted.watcher.goals():
-        if words == "say":
+        if arguments == "say":
             scripted.watcher.wait_for_terminal(goal)
-        assert scripted.goal(goal)["state"] == "SUCCEEDED"  # so it had ended when the command did
-    code, err = unread(scripted, *words.split(), "fail=audio_lost")
-    assert (code, "speech failed" in err) == ((0, False) if words == "say" else (4, words != "say -wq"))
+        assert scripted.goal(goal)["state"] == "SUCCEEDED"  # it ended before the command did
+    code, err = unread(scripted, *arguments.split(), "fail=audio_lost")
+    assert (code, "speech failed" in err) == ((0, False) if arguments == "say" else (4, arguments != "say -wq"))
 
 
 def test_wait_waits_even_if_its_output_was_closed_from_the_start(scripted: Talk) -> None:
@@ -126,63 +126,62 @@ def test_wait_waits_even_if_its_output_was_closed_from_the_start(scripted: Talk)
     assert scripted.goal(goal)["state"] == "ABORTED"
 
 
-@pytest.mark.parametrize("words", ["say -w", "--json say -wf", "wait", "wait -f", "--json wait"])
-def test_a_client_waits_for_its_goal_even_if_the_disk_is_full(scripted: Talk, words: str) -> None:
+@pytest.mark.parametrize("arguments", ["say -w", "--json say -wf", "wait", "wait -f", "--json wait"])
+def test_a_client_waits_for_its_goal_even_if_the_disk_is_full(scripted: Talk, arguments: str) -> None:
     for text, state, code in (("length=0.2", "SUCCEEDED", 1), ("fail=audio_lost length=0.2", "ABORTED", 4)):
-        given = scripted.run("say", text).id if "wait" in words else text
-        ended, err = to(scripted, "/dev/full", *words.split(), given)
+        given = scripted.run("say", text).id if "wait" in arguments else text
+        ended, err = run_to(scripted, "/dev/full", *arguments.split(), given)
         goal = scripted.watcher.goals()[-1]
-        assert scripted.goal(goal)["state"] == state  # so it was waited for
-        notes = [] if words == "wait" else [FULL]
+        assert scripted.goal(goal)["state"] == state  # the command waited for it
+        notes = [] if arguments == "wait" else [FULL]
         notes += (
             [f"talk: {goal}: speech failed: scripted audio_lost; find out why with: talk doctor\n"]
             if state == "ABORTED"
             else []
         )
         assert sorted(err.splitlines(True)) == sorted(notes)
-        assert ended == (0 if words == "wait" and code == 1 else code)  # `wait` shows nothing
+        assert ended == (0 if arguments == "wait" and code == 1 else code)  # `wait` prints nothing
 
 
-@pytest.mark.parametrize("words", ["", "--json", "-w", "--json -f"])
-def test_lines_are_spoken_even_if_the_disk_is_full(scripted: Talk, words: str) -> None:
-    for first, code in (("length=0 a", 1), ("fail=audio_lost", 4) if words[-2:] in {"-w", "-f"} else ("nul \0", 5)):
+@pytest.mark.parametrize("options", ["", "--json", "-w", "--json -f"])
+def test_lines_are_spoken_even_if_the_disk_is_full(scripted: Talk, options: str) -> None:
+    for first, code in (("length=0 a", 1), ("fail=audio_lost", 4) if options[-2:] in {"-w", "-f"} else ("nul \0", 5)):
         lines = f"{first}\nlength=0 b\n"
-        ended, err = to(scripted, "/dev/full", "say", "--lines", *words.split(), stdin=lines)
+        ended, err = run_to(scripted, "/dev/full", "say", "--lines", *options.split(), stdin=lines)
         goal = scripted.watcher.goals()[-1]
         assert scripted.watcher.wait_for_terminal(goal) == "SUCCEEDED"
         assert scripted.goal(goal)["text"] == "length=0 b"
         assert (ended, err.count("can't write to standard output")) == (code, 1)
 
 
-# A reader that goes away meanwhile
+# Readers that go away later
 
 
 class Reader:
-    """A reader of a client's output that goes away."""
+    """The reader of a client's output."""
 
-    def __init__(self, talk: Talk, *words: str, errors: bool = False, terminal: bool = False) -> None:
-        """`errors`: it reads standard error, too; `terminal`: it is a terminal, but not the client's own."""
-        self.descriptor, theirs = os.openpty() if terminal else os.pipe()
-        self.client = Forked(
-            words, talk.env, stdout=theirs, stderr=theirs if errors else subprocess.PIPE, start_new_session=True
-        )
-        os.close(theirs)
-        _wait_until_caught(self.client, signal.SIGHUP)  # after that the client has looked at its output once
+    def __init__(self, talk: Talk, *arguments: str, errors: bool = False, terminal: bool = False) -> None:
+        """`errors`: also read standard error; `terminal`: use a terminal that doesn't control the client."""
+        self.descriptor, client_end = os.openpty() if terminal else os.pipe()
+        stderr = client_end if errors else subprocess.PIPE
+        self.client = Forked(arguments, talk.env, stdout=client_end, stderr=stderr, start_new_session=True)
+        os.close(client_end)
+        _wait_until_caught(self.client, signal.SIGHUP)  # now the client has checked its output once
 
     def leave(self) -> int:
-        """Go away, and return the client's exit code."""
+        """Close the output, and return the client's exit code."""
         os.close(self.descriptor)
         with self.client:
             return self.client.wait(10)
 
 
 ENDLESS = "never-ends words=1"
-#: A goal that takes a moment until it is silent.
+#: A goal that takes 0.2 s to stop.
 SLOW = f"{ENDLESS} slow-stop=0.2"
 
 
 @pytest.mark.parametrize(
-    ("words", "way"),
+    ("arguments", "kind"),
     [
         (["say", "-w"], {}),
         (["say", "-wf"], {}),
@@ -191,18 +190,18 @@ SLOW = f"{ENDLESS} slow-stop=0.2"
         (["-q", "say", "-w"], {"terminal": True, "errors": True}),
     ],
 )
-def test_a_goal_is_cancelled_if_its_reader_goes_away(scripted: Talk, words: list[str], way: dict[str, bool]) -> None:
-    reader = Reader(scripted, *words, ENDLESS, **way)
-    goal = scripted.watcher.wait_until(lambda each: each.get("event") == "word")["id"]
+def test_a_goal_is_cancelled_if_its_reader_leaves(scripted: Talk, arguments: list[str], kind: dict[str, bool]) -> None:
+    reader = Reader(scripted, *arguments, ENDLESS, **kind)
+    goal = scripted.watcher.wait_until(lambda event: event.get("event") == "word")["id"]
     assert reader.leave() == CLOSED
-    assert scripted.goal(goal)["state"] == "PREEMPTED"  # and it was waited for
+    assert scripted.goal(goal)["state"] == "PREEMPTED"  # the client waited for it
     assert scripted.goal(goal)["by"]["client"]["pid"] == reader.client.pid
 
 
 def test_a_pending_goal_is_recalled_if_its_reader_goes_away(scripted: Talk) -> None:
     first = scripted.run("say", ENDLESS).id
     reader = Reader(scripted, "say", "-w", "second")
-    scripted.watcher.wait_until(lambda each: bool(each.get("goal")) and each["goal"]["text"] == "second")
+    scripted.watcher.wait_until(lambda event: bool(event.get("goal")) and event["goal"]["text"] == "second")
     assert reader.leave() == CLOSED
     assert scripted.watcher.wait_for_terminal(scripted.watcher.goals()[-1]) == "RECALLED"
     assert scripted.goal(first)["state"] == "ACTIVE"
@@ -210,15 +209,15 @@ def test_a_pending_goal_is_recalled_if_its_reader_goes_away(scripted: Talk) -> N
 
 @pytest.mark.parametrize("first", ["reader", "signal"])
 @pytest.mark.parametrize(
-    ("words", "way"),
+    ("arguments", "kind"),
     [("say -wf", {}), ("--json say -wf", {"terminal": True}), ("--json say -w", {"errors": True})],
 )
 def test_a_signal_decides_the_exit_code_even_if_the_reader_has_gone(
-    scripted: Talk, words: str, way: dict[str, bool], first: str
+    scripted: Talk, arguments: str, kind: dict[str, bool], first: str
 ) -> None:
     number = signal.SIGINT if first == "reader" else signal.SIGHUP
-    reader = Reader(scripted, *words.split(), SLOW, **way)
-    goal = scripted.watcher.wait_until(lambda each: each.get("event") == "word")["id"]
+    reader = Reader(scripted, *arguments.split(), SLOW, **kind)
+    goal = scripted.watcher.wait_until(lambda event: event.get("event") == "word")["id"]
     if first == "reader":
         reader.client.send_signal(signal.SIGSTOP)
         reader.client.send_signal(number)
@@ -226,26 +225,26 @@ def test_a_signal_decides_the_exit_code_even_if_the_reader_has_gone(
         reader.client.send_signal(signal.SIGCONT)
     else:
         reader.client.send_signal(number)
-        scripted.watcher.wait_for(goal, "PREEMPTING")  # the client has to ask for this
+        scripted.watcher.wait_for(goal, "PREEMPTING")  # the client has requested this
         os.close(reader.descriptor)
     err = reader.client.communicate(timeout=10)[1]
     assert reader.client.returncode == 128 + number
     assert scripted.watcher.wait_for_terminal(goal) == "PREEMPTED"
-    assert err.count("Talk preempted") == (not way.get("errors"))
+    assert err.count("Talk preempted") == (not kind.get("errors"))
 
 
 @pytest.mark.parametrize(
-    ("words", "first"),
+    ("arguments", "first"),
     [("say -w", signal.SIGINT), ("say -wf", signal.SIGHUP), ("say -w --lines", signal.SIGHUP)],
 )
-def test_a_second_signal_does_not_change_the_exit_code(scripted: Talk, words: str, first: signal.Signals) -> None:
-    lines = "--lines" in words
-    client = scripted.start(*words.split(), *([] if lines else [SLOW]), stdin=subprocess.PIPE)
+def test_a_second_signal_does_not_change_the_exit_code(scripted: Talk, arguments: str, first: signal.Signals) -> None:
+    lines = "--lines" in arguments
+    client = scripted.start(*arguments.split(), *([] if lines else [SLOW]), stdin=subprocess.PIPE)
     if lines:
         assert client.stdin
         client.stdin.write(f"{SLOW}\n")
         client.stdin.flush()
-    goal = scripted.watcher.wait_until(lambda each: each.get("event") == "word")["id"]
+    goal = scripted.watcher.wait_until(lambda event: event.get("event") == "word")["id"]
     client.send_signal(first)
     scripted.watcher.wait_for(goal, "PREEMPTING")
     client.send_signal(signal.SIGHUP)
@@ -253,67 +252,67 @@ def test_a_second_signal_does_not_change_the_exit_code(scripted: Talk, words: st
     assert (done.code, done.err.count("Talk preempted")) == (128 + first, 1)
 
 
-@pytest.mark.parametrize("shared", [True, False], ids=["with its input", "alone"])
+@pytest.mark.parametrize("shared", [True, False], ids=["with its input", "output only"])
 def test_nothing_is_spoken_if_the_reader_goes_away_while_text_is_read(scripted: Talk, shared: bool) -> None:
-    ours, theirs = socket.socketpair()  # as sshd gives a command
-    reader, output = (-1, theirs.fileno()) if shared else os.pipe()
-    words = ["say", "-w", "-"]
-    client = Forked(words, scripted.env, stdin=theirs.fileno(), stdout=output, stderr=subprocess.PIPE)
-    theirs.close()
-    ours.send(b"half of a sen")
-    while fcntl.ioctl(ours, termios.TIOCOUTQ, b"    ") != b"\0\0\0\0":  # until it was read, as no event tells
+    reader_end, client_end = socket.socketpair()  # like sshd's for a command
+    reader, output = (-1, client_end.fileno()) if shared else os.pipe()
+    arguments = ["say", "-w", "-"]
+    client = Forked(arguments, scripted.env, stdin=client_end.fileno(), stdout=output, stderr=subprocess.PIPE)
+    client_end.close()
+    reader_end.send(b"half of a sen")
+    while fcntl.ioctl(reader_end, termios.TIOCOUTQ, b"    ") != b"\0\0\0\0":  # no event reports that it was read
         time.sleep(0.002)
     if shared:
-        ours.close()
+        reader_end.close()
     else:
         os.close(output)
         os.close(reader)
-    with ours:
+    with reader_end:
         err = client.communicate(timeout=10)[1]
     assert (client.returncode, err) == (CLOSED, "")
     assert scripted.watcher.goals() == []
 
 
 def test_a_text_is_spoken_if_its_sender_closes_only_the_input(scripted: Talk) -> None:
-    ours, theirs = socket.socketpair()
-    with ours:
-        client = Forked(["say", "-w", "-"], scripted.env, stdin=theirs.fileno(), stdout=theirs.fileno())
-        theirs.close()
-        ours.send(b"length=0 whole")
-        ours.shutdown(socket.SHUT_WR)
+    reader_end, client_end = socket.socketpair()
+    with reader_end:
+        client = Forked(["say", "-w", "-"], scripted.env, stdin=client_end.fileno(), stdout=client_end.fileno())
+        client_end.close()
+        reader_end.send(b"length=0 whole")
+        reader_end.shutdown(socket.SHUT_WR)
         assert client.wait(10) == 0
-        assert scripted.goal(ours.recv(100).decode().strip())["state"] == "SUCCEEDED"
+        assert scripted.goal(reader_end.recv(100).decode().strip())["state"] == "SUCCEEDED"
 
 
-@pytest.mark.parametrize("words", [["say", "-w"], ["say", "-wf"]])
-def test_a_closed_reader_of_an_attached_client_cancels_nothing(scripted: Talk, words: list[str]) -> None:
-    text = "never-ends length=60 " + "word " * 600  # one in a tenth of a second
+@pytest.mark.parametrize("arguments", [["say", "-w"], ["say", "-wf"]])
+def test_a_closed_reader_of_an_attached_client_cancels_nothing(scripted: Talk, arguments: list[str]) -> None:
+    text = "never-ends length=60 " + "word " * 600  # ten words per second
     scripted.run("say", "--id", "mine", text)
     scripted.watcher.wait_for_word("mine")
-    reader = Reader(scripted, *words, "--id", "mine", text)
+    reader = Reader(scripted, *arguments, "--id", "mine", text)
     assert os.read(reader.descriptor, 4) == b"mine"
     assert reader.leave() == CLOSED
     assert scripted.goal("mine")["state"] == "ACTIVE"
 
 
 @pytest.mark.parametrize(
-    ("words", "terminal"),
+    ("arguments", "terminal"),
     [(["wait"], True), (["wait", "-f"], False), (["wait", "-f"], True), (["--json", "wait"], False)],
 )
-def test_a_closed_reader_ends_wait_and_cancels_nothing(scripted: Talk, words: list[str], terminal: bool) -> None:
+def test_a_closed_reader_ends_wait_and_cancels_nothing(scripted: Talk, arguments: list[str], terminal: bool) -> None:
     goal = scripted.run("say", ENDLESS).id
-    reader = Reader(scripted, *words, goal, terminal=terminal)
-    if terminal and words == ["wait", "-f"]:
+    reader = Reader(scripted, *arguments, goal, terminal=terminal)
+    if terminal and arguments == ["wait", "-f"]:
         assert os.read(reader.descriptor, 1)
     assert reader.leave() == CLOSED
     assert scripted.goal(goal)["state"] in {"PENDING", "ACTIVE"}
 
 
 def test_sighup_cancels_the_goal_of_say_unless_nohup_blocks_it(scripted: Talk) -> None:
-    for words, code, state in ((["say", "-w"], 129, "PREEMPTED"), (["wait"], 129, "ACTIVE")):
-        goal = scripted.run("say", ENDLESS).id if words == ["wait"] else None
-        client = scripted.start(*words, goal or ENDLESS)
-        goal = goal or scripted.watcher.wait_until(lambda each: each.get("event") == "word")["id"]
+    for arguments, code, state in ((["say", "-w"], 129, "PREEMPTED"), (["wait"], 129, "ACTIVE")):
+        goal = scripted.run("say", ENDLESS).id if arguments == ["wait"] else None
+        client = scripted.start(*arguments, goal or ENDLESS)
+        goal = goal or scripted.watcher.wait_until(lambda event: event.get("event") == "word")["id"]
         _wait_until_caught(client, signal.SIGHUP)
         client.send_signal(signal.SIGHUP)
         assert scripted.finish(client).code == code
@@ -332,11 +331,11 @@ def test_sighup_cancels_the_goal_of_say_unless_nohup_blocks_it(scripted: Talk) -
 
 
 def _wait_until_caught(client: Process, number: int) -> None:
-    """Wait until a process catches a signal, as no event tells."""
+    """Wait until a process catches a signal. No event reports this."""
     while True:
-        assert client.poll() is None, "it has ended"
+        assert client.poll() is None, "the client has ended"
         with open(f"/proc/{client.pid}/status", encoding="utf-8") as status:
-            caught = next(int(each.split()[1], 16) for each in status if each.startswith("SigCgt:"))
+            caught = next(int(line.split()[1], 16) for line in status if line.startswith("SigCgt:"))
         if caught >> (number - 1) & 1:
             return
         time.sleep(0.002)

@@ -1,4 +1,4 @@
-"""`talk pause` and `talk resume`: their messages, output and exit codes. Other tests compare what is heard."""
+"""The messages, output and exit codes of `talk pause` and `talk resume`. Other tests compare the sound."""
 
 from __future__ import annotations
 
@@ -18,62 +18,62 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture
-def held(scripted: Talk) -> str:
+def active(scripted: Talk) -> str:
     """The id of a goal that is being spoken."""
     goal_id = scripted.run("say", "--", "never-ends \x1b[31m\u202e").id
-    scripted.watcher.wait_until(lambda each: each["id"] == goal_id and each.get("number") == 2)
+    scripted.watcher.wait_until(lambda event: event["id"] == goal_id and event.get("number") == 2)
     return goal_id
 
 
-def test_pause_and_resume_report_the_affected_goal(scripted: Talk, held: str) -> None:
+def test_pause_and_resume_report_the_affected_goal(scripted: Talk, active: str) -> None:
     done = scripted.run("pause")
     assert (done.code, done.out) == (0, "")
-    assert done.err.startswith(f'talk: goal {held} is paused after "never-ends')
+    assert done.err.startswith(f'talk: goal {active} is paused after "never-ends')
     assert done.err.endswith('"; continue with: talk resume\n')
     assert ("\x1b" in done.err, r"\x1b[31m\u202e" in done.err) == (False, True)
-    assert scripted.goal(held)["paused"] is True
+    assert scripted.goal(active)["paused"] is True
     again = scripted.run("pause")
-    assert (again.code, f"goal {held} is paused" in again.err) == (0, True)
+    assert (again.code, f"goal {active} is paused" in again.err) == (0, True)
     resumed = scripted.run("resume")
-    assert (resumed.code, resumed.out, resumed.err) == (0, "", f"talk: speech continues with goal {held}\n")
-    assert scripted.goal(held)["paused"] is False
+    assert (resumed.code, resumed.out, resumed.err) == (0, "", f"talk: speech continues with goal {active}\n")
+    assert scripted.goal(active)["paused"] is False
     again = scripted.run("resume")
-    assert (again.code, again.out, again.err) == (0, "", f"talk: speech continues with goal {held}\n")
-    told = json.loads(scripted.run("pause", "--json").out)
-    assert (told["paused"], told["goal"]["id"], told["goal"]["paused"]) == (True, held, True)
-    told = json.loads(scripted.run("resume", "--json").out)
-    assert (told["paused"], told["goal"]["id"], told["goal"]["paused"]) == (False, held, False)
+    assert (again.code, again.out, again.err) == (0, "", f"talk: speech continues with goal {active}\n")
+    reply = json.loads(scripted.run("pause", "--json").out)
+    assert (reply["paused"], reply["goal"]["id"], reply["goal"]["paused"]) == (True, active, True)
+    reply = json.loads(scripted.run("resume", "--json").out)
+    assert (reply["paused"], reply["goal"]["id"], reply["goal"]["paused"]) == (False, active, False)
     for command in ("pause", "resume"):
         quiet = scripted.run(command, "-q")
         assert (quiet.code, quiet.out, quiet.err) == (0, "", "")
     scripted.run("cancel")
 
 
-def test_status_shows_the_paused_goal(scripted: Talk, held: str) -> None:
+def test_status_shows_the_paused_goal(scripted: Talk, active: str) -> None:
     scripted.run("pause")
     status = scripted.run("status").out
     assert "paused   speech is paused; continue with: talk resume\n" in status
-    assert f"now      {held.partition('-')[2]}  ACTIVE" in status
+    assert f"now      {active.partition('-')[2]}  ACTIVE" in status
     assert ", paused, for " in status
-    assert "state    ACTIVE, paused\n" in scripted.run("status", held).out
+    assert "state    ACTIVE, paused\n" in scripted.run("status", active).out
     assert json.loads(scripted.run("--json", "status").out)["server"]["paused"] is True
     scripted.run("resume")
     assert "speech is paused" not in scripted.run("status").out
     scripted.run("cancel")
 
 
-def begin(talk: Talk, text: str) -> str:
+def say_until_heard(talk: Talk, text: str) -> str:
     goal_id = talk.run("say", text).id
-    talk.watcher.wait_for_word(goal_id)  # at ACTIVE, the engine may still be starting
+    talk.watcher.wait_for_word(goal_id)  # the engine may still be starting when the goal is ACTIVE
     return goal_id
 
 
 def test_a_resume_answers_a_pause_that_is_not_silent_yet(scripted: Talk) -> None:
-    goal = begin(scripted, "never-ends slow-pause=1")
+    goal = say_until_heard(scripted, "never-ends slow-pause=1")
     with scripted.connect() as wire:
         wire.send_raw(b'{"seq": 1, "request": "pause"}\n{"seq": 2, "request": "resume"}\n')
         first, second = wire.receive(), wire.receive()
-        assert [(each["seq"], each["ok"], each["paused"]) for each in (first, second)] == [
+        assert [(reply["seq"], reply["ok"], reply["paused"]) for reply in (first, second)] == [
             (1, True, False),
             (2, True, False),
         ]
@@ -82,30 +82,30 @@ def test_a_resume_answers_a_pause_that_is_not_silent_yet(scripted: Talk) -> None
 
 
 def test_a_late_confirmation_does_not_answer_the_next_pause(scripted: Talk) -> None:
-    begin(scripted, "never-ends stale-pause slow-pause=0.4")
+    say_until_heard(scripted, "never-ends stale-pause slow-pause=0.4")
     with scripted.connect() as wire:
         wire.send_raw(b'{"seq": 1, "request": "pause"}\n{"seq": 2, "request": "resume"}\n')
-        asked = time.monotonic()
+        asked_at = time.monotonic()
         wire.send({"seq": 3, "request": "pause"})
         assert [wire.receive()["seq"] for _ in range(3)] == [1, 2, 3]
-        assert time.monotonic() - asked >= 0.4
+        assert time.monotonic() - asked_at >= 0.4
     scripted.run("cancel")
 
 
 def test_each_unconfirmed_pause_fails_after_its_own_time_limit(make_talk: MakeTalk, tmp_path: Path) -> None:
     limit = 0.5
     talk = make_talk(program=patched_serve(tmp_path, requests__PAUSE_ANSWER_S=limit))
-    begin(talk, "never-ends ignore-pause")
+    say_until_heard(talk, "never-ends ignore-pause")
     with talk.connect() as wire:
         wire.send({"seq": 1, "request": "pause"})
         with pytest.raises(TimeoutError):
             wire.receive(limit / 4)
-        asked = time.monotonic()
+        asked_at = time.monotonic()
         wire.send({"seq": 2, "request": "pause"})
         for seq in (1, 2):
             reply = wire.receive()
             assert (reply["seq"], reply["error"]["code"]) == (seq, "not_silent")
-        assert time.monotonic() - asked >= 0.95 * limit
+        assert time.monotonic() - asked_at >= 0.95 * limit
     talk.run("resume")
     talk.run("cancel")
 

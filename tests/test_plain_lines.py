@@ -1,4 +1,4 @@
-"""Plain command lines are read without click, but alike, and sent before the rest is imported."""
+"""Simple command lines are parsed without click, but with the same result, and sent before most imports."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
     from talkcli.protocol.requests import Request
 
 PLAIN = [*COMMANDS]
-#: The options of a goal.
-GIVEN = [each.name for each in Say.options if each.flags and each.name not in {"wait", "feedback"}]
+#: The options that become fields of a goal.
+GOAL_OPTIONS = [option.name for option in Say.options if option.flags and option.name not in {"wait", "feedback"}]
 TYPED = ParameterSource.COMMANDLINE
-ROWS = [*COMMON_OPTIONS, *(option for each in COMMANDS.values() for option in each.options)]
-SPELLINGS = {form: each for each in ROWS for part in each.flags.split("/") for form in part.split(", ")}
+ROWS = [*COMMON_OPTIONS, *(option for command in COMMANDS.values() for option in command.options)]
+SPELLINGS = {form: row for row in ROWS for part in row.flags.split("/") for form in part.split(", ")}
 OPTIONS = sorted(SPELLINGS)
 VALUES = [
     *("0", "1", "7", "0.5", "1.0", "80", "451", "-3", "+5", "1_0", " 5", "1e3", ".5", "5.", "nan", "inf", "", "٣"),
@@ -48,40 +48,40 @@ WORDS = [
     *("4k7f-12", "12", "Grüße", "back\\slash", "-x", "battery low", 'a "quoted" word', "two\nlines", "\udc80"),
     "\x1b[1m",
 ]
-FLAGS = [form for form, each in SPELLINGS.items() if each.kind is FLAG]
+FLAGS = [form for form, row in SPELLINGS.items() if row.kind is FLAG]
 VALUED = st.tuples(st.sampled_from(OPTIONS), st.sampled_from(["1", "0.5", "90", "k"]))
-#: Mostly plain pieces: a flag, an option with a value that fits most, words; and now and then anything.
+#: Parts of command lines: flags, options with a usually valid value, words, and sometimes arbitrary parts.
 PIECES = st.one_of(
-    st.sampled_from(FLAGS).map(lambda each: [each]),
+    st.sampled_from(FLAGS).map(lambda argument: [argument]),
     VALUED.map(list),
-    VALUED.map("=".join).map(lambda each: [each]),
+    VALUED.map("=".join).map(lambda argument: [argument]),
     st.sampled_from([["battery low"], ["12"], ["4k7f-12"], ["Grüße"], ["--", "-3 degrees"]]),
-    st.sampled_from(WORDS).map(lambda each: [each]),
+    st.sampled_from(WORDS).map(lambda argument: [argument]),
 )
 LINES = st.builds(
     lambda before, command, after: [*before, *command, *(word for piece in after for word in piece)],
     st.sampled_from([[], [], ["--json"], ["-q", "--socket", "/run/x"], ["--socket=/run/y"], ["--version"]]),
-    st.sampled_from([[each] for each in PLAIN] * 4 + [[], ["watch"], ["sya"]]),
+    st.sampled_from([[name] for name in PLAIN] * 4 + [[], ["watch"], ["sya"]]),
     st.lists(PIECES, max_size=4),
 )
 ENVIRONMENTS = st.sampled_from([{}, {"TALK_NAME": "patrol"}, {"TALK_NAME": ""}])
 
 
 def by_click(arguments: list[str]) -> tuple[str, dict[str, Any], CommonOptions]:
-    """Return the command, its options and arguments, and the common ones, as click reads them; UsageError."""
+    """Return the command, its options and arguments, and the common options, as click parses them."""
     options = CommonOptions()
     with talk.make_context("talk", list(arguments), obj=options) as group:
         name, command, rest = talk.resolve_command(group, [*group._protected_args, *group.args])
         assert name
         assert command
         with command.make_context(name, rest, parent=group) as context:
-            options.typed = frozenset(each for each in context.params if context.get_parameter_source(each) is TYPED)
+            options.typed = frozenset(name for name in context.params if context.get_parameter_source(name) is TYPED)
             return name, context.params, options
 
 
 @contextlib.contextmanager
-def named(environment: Mapping[str, str]) -> Iterator[None]:
-    """Have this variable for the name of the sender, or none."""
+def sender_name(environment: Mapping[str, str]) -> Iterator[None]:
+    """Set or delete the variable TALK_NAME."""
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("TALK_NAME", raising=False)
         for name, value in environment.items():
@@ -89,25 +89,25 @@ def named(environment: Mapping[str, str]) -> Iterator[None]:
         yield
 
 
-def assert_read_alike(arguments: list[str]) -> None:
-    found = plain.read(arguments, os.environ)
-    if not found:
+def assert_parsed_like_click(arguments: list[str]) -> None:
+    parsed = plain.read(arguments, os.environ)
+    if not parsed:
         return
     command, params, options = by_click(arguments)
-    assert (found.command.name, found.given) == (command, params)
-    assert {*found.typed} == {each.name for each in found.command.options if each.name in options.typed}
-    assert found.common.get("socket") == options.socket
-    assert found.common.get("connect_timeout") == options.connect_timeout
-    assert (found.common.get("json", False), found.common.get("quiet", False)) == (options.json, options.quiet)
+    assert (parsed.command.name, parsed.given) == (command, params)
+    assert {*parsed.typed} == {option.name for option in parsed.command.options if option.name in options.typed}
+    assert parsed.common.get("socket") == options.socket
+    assert parsed.common.get("connect_timeout") == options.connect_timeout
+    assert (parsed.common.get("json", False), parsed.common.get("quiet", False)) == (options.json, options.quiet)
 
 
-def assert_sent_as_by_the_library(arguments: list[str]) -> None:
-    found = plain.read(arguments, os.environ)
-    sent = found and sent_early(found)
-    if not found or not sent:
+def assert_sent_like_the_library(arguments: list[str]) -> None:
+    parsed = plain.read(arguments, os.environ)
+    sent = parsed and sent_early(parsed)
+    if not parsed or not sent:
         return
-    request = library_sends(found)[1]
-    assert sent == written(found)
+    request = library_requests(parsed)[1]
+    assert sent == library_messages(parsed)
     if isinstance(request, Say):
         check(request)
         assert too_long(request) is None
@@ -118,20 +118,18 @@ def assert_sent_as_by_the_library(arguments: list[str]) -> None:
 def test_simple_lines_are_parsed_like_click_and_sent_like_the_library(
     arguments: list[str], environment: Mapping[str, str]
 ) -> None:
-    with named(environment):
-        assert_read_alike(arguments)
-        assert_sent_as_by_the_library(arguments)
+    with sender_name(environment):
+        assert_parsed_like_click(arguments)
+        assert_sent_like_the_library(arguments)
 
 
 @pytest.mark.slow
 @settings(max_examples=5000, deadline=None)
 @given(LINES, ENVIRONMENTS)
-def test_thousands_of_simple_lines_are_parsed_and_sent_alike(
-    arguments: list[str], environment: Mapping[str, str]
-) -> None:
-    with named(environment):
-        assert_read_alike(arguments)
-        assert_sent_as_by_the_library(arguments)
+def test_thousands_of_lines_are_parsed_and_sent_alike(arguments: list[str], environment: Mapping[str, str]) -> None:
+    with sender_name(environment):
+        assert_parsed_like_click(arguments)
+        assert_sent_like_the_library(arguments)
 
 
 @pytest.mark.parametrize(
@@ -167,41 +165,41 @@ def test_typical_script_lines_are_parsed_without_click(line: str) -> None:
         *(["say", "--stream", "x"], ["say", "--stall", "5", "x"], ["say", "--stream", "--stall", "0"]),
     ],
 )
-def test_other_lines_are_left_to_click(line: list[str]) -> None:
+def test_other_lines_are_parsed_by_click(line: list[str]) -> None:
     assert plain.read(line, {}) is None
 
 
-def sent_early(found: plain.PlainCommand) -> tuple[JsonObject, JsonObject] | None:
-    """Return the requests that are sent early for a command; None if there are none."""
-    return plain.early_messages(found) if plain.may_send_early(found) else None
+def sent_early(parsed: plain.PlainCommand) -> tuple[JsonObject, JsonObject] | None:
+    """Return the requests that are sent early for a command; None if nothing is sent early."""
+    return plain.early_messages(parsed) if plain.may_send_early(parsed) else None
 
 
-def library_sends(found: plain.PlainCommand) -> tuple[Hello, Request]:
+def library_requests(parsed: plain.PlainCommand) -> tuple[Hello, Request]:
     """Return the requests that the client library sends for a command."""
-    name, command = found.given.get("name") or os.environ.get("TALK_NAME") or None, found.command.name
+    name, command = parsed.given.get("name") or os.environ.get("TALK_NAME") or None, parsed.command.name
     hello = Hello(name, urgent=command in {"cancel", "status"})
     if command == "say":
-        text, options = " ".join(found.given["text"]), {each: found.given[each] for each in GIVEN}
-        feedback = found.given["feedback"]
-        return hello, Say(text, wait=found.given["wait"] or feedback, feedback=feedback, **options)
+        text, options = " ".join(parsed.given["text"]), {name: parsed.given[name] for name in GOAL_OPTIONS}
+        feedback = parsed.given["feedback"]
+        return hello, Say(text, wait=parsed.given["wait"] or feedback, feedback=feedback, **options)
     if command == "cancel":
-        given = found.given
+        given = parsed.given
         return hello, Cancel(given["ids"] or None, given["current"], given["before"], given["key"])
-    others: dict[str, Request] = {"status": Status(found.given.get("goal_id")), "pause": Pause(), "resume": Resume()}
+    others: dict[str, Request] = {"status": Status(parsed.given.get("goal_id")), "pause": Pause(), "resume": Resume()}
     return hello, others[command]
 
 
-def written(found: plain.PlainCommand) -> tuple[JsonObject, JsonObject]:
-    """Return the requests that the client library sends for a command, as they go over the wire."""
-    hello, request = library_sends(found)
+def library_messages(parsed: plain.PlainCommand) -> tuple[JsonObject, JsonObject]:
+    """Return the requests that the client library sends for a command, in JSON."""
+    hello, request = library_requests(parsed)
     return write_request(hello), write_request(request)
 
 
 @settings(max_examples=50)
 @given(st.text(max_size=40))
 def test_any_text_is_sent_early_unchanged(text: str) -> None:
-    found = plain.read(["say", "--", text], {})
-    assert not found or text == "-" or sent_early(found) == (write_request(Hello()), write_request(Say(text)))
+    parsed = plain.read(["say", "--", text], {})
+    assert not parsed or text == "-" or sent_early(parsed) == (write_request(Hello()), write_request(Say(text)))
 
 
 @pytest.mark.parametrize(
@@ -212,9 +210,9 @@ def test_any_text_is_sent_early_unchanged(text: str) -> None:
     ],
 )
 def test_a_request_that_only_the_server_checks_is_sent_early(line: list[str]) -> None:
-    found = plain.read(line, {})
-    assert found
-    assert sent_early(found) == written(found)
+    parsed = plain.read(line, {})
+    assert parsed
+    assert sent_early(parsed) == library_messages(parsed)
 
 
 @pytest.mark.parametrize(
@@ -227,9 +225,9 @@ def test_a_request_that_only_the_server_checks_is_sent_early(line: list[str]) ->
     ],
 )
 def test_a_request_that_the_library_may_change_or_refuse_is_not_sent_early(line: list[str]) -> None:
-    found = plain.read(line, {})
-    assert found
-    assert sent_early(found) is None
+    parsed = plain.read(line, {})
+    assert parsed
+    assert sent_early(parsed) is None
 
 
 def test_the_expected_greeting_matches_the_servers() -> None:

@@ -1,7 +1,7 @@
-"""On a system without Linux's own interfaces, as macOS is one, talk is imported, helps, serves, speaks and cancels.
+"""talk works on systems without Linux-specific interfaces, such as macOS.
 
-`tests/support/macos` hides these interfaces. Apple's own voice can't be tried here: pyttsx3's driver "dummy" stands
-in for it, as both speak without talk's player; and talk's own driver is tried on a Linux without these names.
+`tests/support/macos` hides these interfaces. pyttsx3's driver "dummy" replaces Apple's driver, which can't be tested
+here. Both speak without talk's player. talk's own driver is tested on a Linux without these interfaces.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ if TYPE_CHECKING:
     from tests.conftest import MakeTalk
 
 PATH = os.pathsep.join([str(Path(__file__).parent / "support" / "macos"), str(Path(__file__).parents[1])])
-_PEEK = "import sys, os, fcntl, select, socket; print(sys.platform, os.path.exists('/proc/self'), *({} & {}))"
+_SHOW_PLATFORM = "import sys, os, fcntl, select, socket; print(sys.platform, os.path.exists('/proc/self'), *({} & {}))"
 _IMPORT_ALL = """
 import importlib, pkgutil, click, talkcli
-names = [each.name for each in pkgutil.walk_packages(talkcli.__path__, "talkcli.")]
+names = [module.name for module in pkgutil.walk_packages(talkcli.__path__, "talkcli.")]
 for name in names:
     if not name.endswith("__main__"):
         importlib.import_module(name)
 from talkcli.cli.click_app import talk
 with click.Context(talk, info_name="talk") as parent:
-    commands = {each: talk.get_command(parent, each) for each in talk.list_commands(parent)}
+    commands = {name: talk.get_command(parent, name) for name in talk.list_commands(parent)}
     for name, command in commands.items():
         with click.Context(command, info_name=name, parent=parent) as context:
             assert "exit codes: talk --help" in command.get_help(context), name
@@ -41,7 +41,7 @@ print(len(names), len(commands))
 
 
 def on_macos(*command: str, **extra: str) -> str:
-    """Run a program without these interfaces, assert that it succeeds, and return its output."""
+    """Run a program without Linux-specific interfaces, assert that it succeeds, and return its output."""
     with short_directory() as home:
         done = run(command, environment(home, **{"PYTHONPATH": PATH, "TALK_SOCKET": f"{home}/s", **extra}))
     assert (done.code, done.err) == (0, "")
@@ -50,50 +50,50 @@ def on_macos(*command: str, **extra: str) -> str:
 
 def test_the_linux_interfaces_are_hidden() -> None:
     names = {"pidfd_open", "waitid", "F_SETSIG", "F_SETPIPE_SZ", "epoll", "SO_PEERCRED", "prctl"}
-    code = _PEEK.format(names, "{*dir(os), *dir(fcntl), *dir(select), *dir(socket)}")
+    code = _SHOW_PLATFORM.format(names, "{*dir(os), *dir(fcntl), *dir(select), *dir(socket)}")
     assert on_macos(sys.executable, "-c", code) == "darwin False\n"
     assert on_macos(sys.executable, "-c", code, PYTHONPATH="").startswith("linux True ")
 
 
 def test_every_module_can_be_imported_and_every_command_has_help() -> None:
     modules = sum(1 for _ in Path(talkcli.__path__[0]).rglob("*.py"))
-    found = on_macos(sys.executable, "-c", _IMPORT_ALL)
-    assert found == f"{modules - 1} {len(COMMANDS)}\n"  # the package itself is there by then
+    counts = on_macos(sys.executable, "-c", _IMPORT_ALL)
+    assert counts == f"{modules - 1} {len(COMMANDS)}\n"  # the package itself is already imported
     assert "Exit codes:" in on_macos(*TALK, "--help")
 
 
 @pytest.mark.parametrize(("platform", "driver"), [("darwin", "dummy"), ("linux", "espeak")])
 def test_speech_can_be_awaited_paused_cancelled_and_examined(make_talk: MakeTalk, platform: str, driver: str) -> None:
-    """The platform's name differs, or only its interfaces."""
+    """One case also sets the name of the platform. The other only hides Linux's interfaces."""
     env = {"PYTHONPATH": PATH, "TALK_TEST_PLATFORM": platform}
-    served = make_talk("--player", "null", "--rate", "450", driver=driver, env=env)
-    done = served.run("--json", "say", "--wait", "battery low")
+    server = make_talk("--player", "null", "--rate", "450", driver=driver, env=env)
+    done = server.run("--json", "say", "--wait", "battery low")
     goal = json.loads(done.out)
     assert (done.code, goal["state"], goal["text"]) == (0, "SUCCEEDED", "battery low")
     assert goal["client"]["uid"] == os.getuid()
     assert goal["client"]["pid"] > 1
-    assert served.run("wait", goal["id"]).code == 0
-    assert "SUCCEEDED" in served.run("status").out
-    assert served.run("voices").out
-    words = served.run("say", "--feedback", "one two three").out
+    assert server.run("wait", goal["id"]).code == 0
+    assert "SUCCEEDED" in server.run("status").out
+    assert server.run("voices").out
+    words = server.run("say", "--feedback", "one two three").out
     assert [line.split()[-1] for line in words.splitlines() if " word " in line] == ["one", "two", "three"]
 
-    assert served.run("pause").code == 0
-    ids = [served.run("say", each).id for each in ("one", "two", "three")]
-    assert served.run("cancel", ids[1]).id == ids[1]
-    assert served.run("resume").code == 0
-    assert served.run("wait").code == 0
-    assert [served.goal(each)["state"] for each in ids] == ["SUCCEEDED", "RECALLED", "SUCCEEDED"]
+    assert server.run("pause").code == 0
+    ids = [server.run("say", text).id for text in ("one", "two", "three")]
+    assert server.run("cancel", ids[1]).id == ids[1]
+    assert server.run("resume").code == 0
+    assert server.run("wait").code == 0
+    assert [server.goal(goal_id)["state"] for goal_id in ids] == ["SUCCEEDED", "RECALLED", "SUCCEEDED"]
 
-    done = served.run("doctor", "--silent", "--json")
-    found = {each["check"]: each for each in map(json.loads, done.out.splitlines())}
+    done = server.run("doctor", "--silent", "--json")
+    findings = {finding["check"]: finding for finding in map(json.loads, done.out.splitlines())}
     assert done.err == ""
-    assert {"python", "pyttsx3", "socket", "server", "settings", "sentence"} <= found.keys()
-    assert found["server"]["state"] == found["sentence"]["state"] == "ok"
+    assert {"python", "pyttsx3", "socket", "server", "settings", "sentence"} <= findings.keys()
+    assert findings["server"]["state"] == findings["sentence"]["state"] == "ok"
 
 
 def test_a_player_is_awaited_and_killed_and_its_failure_is_reported(make_talk: MakeTalk) -> None:
-    """With talk's own driver: one program plays silence for longer than it is fed, and another one fails."""
+    """talk's own driver with two players: one plays on after its input ends, and the other fails."""
     env = {"PYTHONPATH": PATH, "TALK_TEST_PLATFORM": "linux"}
     talk = make_talk("--player", "sh -c 'cat >/dev/null; sleep 0.4'", "--rate", "450", env=env)
     assert talk.run("say", "--wait", "hi").code == 0

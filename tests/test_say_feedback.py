@@ -1,4 +1,4 @@
-"""`say --feedback` and `wait --feedback` in a pipe print a line or an object for each event, at once."""
+"""`say --feedback` and `wait --feedback` print each event to a pipe at once, as a line or an object."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ if TYPE_CHECKING:
 
 
 def lines_of(client: Process) -> Iterator[str]:
-    """Return the client's lines as they come."""
+    """Yield the client's lines as they arrive."""
     assert client.stdout
-    return (each.rstrip("\n") for each in client.stdout)
+    return (line.rstrip("\n") for line in client.stdout)
 
 
-#: Spoken until it is stopped, with ten words a second, so that a client that follows it soon prints one.
+#: Ten words per second until it is stopped, so that a client that follows it soon prints one.
 TALKING = "never-ends length=60 " + "word " * 600
 
 
 def objects(out: str) -> list[dict[str, Any]]:
-    return [json.loads(each) for each in out.splitlines()]
+    return [json.loads(line) for line in out.splitlines()]
 
 
 def test_each_event_is_printed_as_one_line_of_fields(scripted: Talk) -> None:
@@ -46,12 +46,12 @@ def test_json_prints_the_protocols_events_and_then_the_result(scripted: Talk) ->
     done = scripted.run("--json", "say", "-wf", "--", "length=0.2 battery low")
     *events, result = objects(done.out)
     goal_id = events[0]["id"]
-    # A watcher gets the whole goal, too.
-    told = [
-        {name: value for name, value in each.items() if name != "goal"} for each in scripted.watcher.events(goal_id)
+    # A watcher's events also contain the whole goal.
+    watched = [
+        {name: value for name, value in event.items() if name != "goal"} for event in scripted.watcher.events(goal_id)
     ]
-    assert events == told
-    assert [each["event"] for each in events] == ["state", "state", "word", "word", "word", "state"]
+    assert events == watched
+    assert [event["event"] for event in events] == ["state", "state", "word", "word", "word", "state"]
     assert events[3].keys() == {"event", "id", "word", "start", "end", "number", "time", "n", "at"}
     assert result == {"event": "result", "goal": scripted.goal(goal_id)}
 
@@ -67,12 +67,12 @@ def test_the_last_object_is_the_result_for_every_outcome(scripted: Talk) -> None
     client = scripted.start("--json", "say", "-f", TALKING)
     lines = lines_of(client)
     goal_id = json.loads(next(lines))["id"]
-    as_lines = scripted.start("wait", "-f", goal_id)
-    found = lines_of(as_lines)
-    assert next(found).startswith(f"{goal_id} ")
+    waiting = scripted.start("wait", "-f", goal_id)
+    printed = lines_of(waiting)
+    assert next(printed).startswith(f"{goal_id} ")
     scripted.kill()
-    assert (json.loads(list(lines)[-1])["goal"]["state"], list(found)[-1]) == ("LOST", f"{goal_id} LOST")
-    assert (client.wait(10), as_lines.wait(10)) == (12, 12)
+    assert (json.loads(list(lines)[-1])["goal"]["state"], list(printed)[-1]) == ("LOST", f"{goal_id} LOST")
+    assert (client.wait(10), waiting.wait(10)) == (12, 12)
 
 
 def test_pause_and_resume_are_shown(scripted: Talk) -> None:
@@ -83,7 +83,7 @@ def test_pause_and_resume_are_shown(scripted: Talk) -> None:
     for command in ("pause", "resume"):
         assert scripted.run(command).code == 0
     client.send_signal(signal.SIGTERM)
-    shown = [each.split()[1] for each in lines]
+    shown = [line.split()[1] for line in lines]
     assert shown == ["ACTIVE", "word", "PAUSED", "RESUMED", "PREEMPTING", "PREEMPTED"]
     assert client.wait(10) == 143
 
@@ -97,15 +97,15 @@ def test_wait_follows_several_goals_in_the_servers_order(scripted: Talk) -> None
     lines = lines_of(client)
     first = next(lines)
     scripted.run("cancel", "--current")
-    found = [json.loads(each) for each in (first, *lines)]
+    events = [json.loads(line) for line in (first, *lines)]
     assert client.wait(10) == 7
-    ids = [each["id"] if "id" in each else each["goal"]["id"] for each in found]
+    ids = [event["id"] if "id" in event else event["goal"]["id"] for event in events]
     assert list(dict.fromkeys(ids)) == [blocking, high, low]
-    numbers = [each["n"] for each in found if "n" in each]
+    numbers = [event["n"] for event in events if "n" in event]
     assert numbers == sorted(set(numbers))
-    assert [each["goal"]["id"] for each in found if each["event"] == "result"] == [blocking, high, low]
+    assert [event["goal"]["id"] for event in events if event["event"] == "result"] == [blocking, high, low]
     for goal_id in (low, high):
-        own = [each.get("state", each["event"]) for each in found if each.get("id") == goal_id]
+        own = [event.get("state", event["event"]) for event in events if event.get("id") == goal_id]
         assert own == ["ACTIVE", "word", "word", "SUCCEEDED"]
 
 
@@ -117,11 +117,11 @@ def test_wait_without_ids_follows_all_current_goals(scripted: Talk) -> None:
     client = scripted.start("wait", "-f")
     lines = lines_of(client)
     assert next(lines).startswith(f"{first} word ")
-    for words in (["pause"], ["resume"], ["cancel", first]):
-        assert scripted.run(*words).code == 0
-    states = [each for each in lines if " word " not in each]
+    for arguments in (["pause"], ["resume"], ["cancel", first]):
+        assert scripted.run(*arguments).code == 0
+    states = [line for line in lines if " word " not in line]
     assert states == [
-        f"{first} PAUSED",  # once, not once for each goal
+        f"{first} PAUSED",  # once for all goals
         f"{first} RESUMED",
         f"{first} PREEMPTING",
         f"{first} PREEMPTED",
@@ -129,12 +129,12 @@ def test_wait_without_ids_follows_all_current_goals(scripted: Talk) -> None:
         f"{second} ABORTED",
     ]
     assert scripted.finish(client).err == ""
-    assert client.returncode == 0  # only goals that are named can fail
+    assert client.returncode == 0  # without ids, failures don't count
 
 
 def test_wait_for_an_ended_goal_shows_its_state(scripted: Talk) -> None:
     goal_id = scripted.run("say", "--wait", "fail=audio_lost").id
     done = scripted.run("wait", "--feedback", goal_id)
     assert (done.code, done.out) == (4, f"{goal_id} ABORTED\n")
-    found = objects(scripted.run("--json", "wait", "-f", goal_id).out)
-    assert found == [{"event": "result", "goal": scripted.goal(goal_id)}]
+    events = objects(scripted.run("--json", "wait", "-f", goal_id).out)
+    assert events == [{"event": "result", "goal": scripted.goal(goal_id)}]

@@ -1,4 +1,4 @@
-"""`say --lines`: each line of standard input is a goal. Few are pending, and none is spoken too late or twice."""
+"""`say --lines`: each line of standard input is a goal. Few are pending, and none is spoken late or twice."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ ENDLESS = "never-ends words=1\n"
 class Typing:
     """A client whose standard input stays open."""
 
-    def __init__(self, talk: Talk, *words: str) -> None:
-        self.client = talk.start(*words, stdin=subprocess.PIPE)
+    def __init__(self, talk: Talk, *arguments: str) -> None:
+        self.client = talk.start(*arguments, stdin=subprocess.PIPE)
         assert self.client.stdin
         assert self.client.stdout
         assert self.client.stderr
@@ -45,7 +45,7 @@ class Typing:
         return self._output.readline().rstrip("\n")
 
     def end(self, number: signal.Signals | None = None) -> tuple[int, list[str], str]:
-        """Send it a signal, or close its input. Return its exit code, the rest of its output, and its messages."""
+        """Send the client a signal, or close its input. Return its exit code, remaining output and messages."""
         if number is None:
             self._input.close()
         else:
@@ -64,12 +64,12 @@ def test_each_line_is_a_goal_and_its_id_is_printed(scripted: Talk) -> None:
     ids = done.out.split()
     assert len(ids) == 4
     scripted.watcher.wait_for_terminal(ids[-1])
-    said = ["length=0 one", "length=0 two", "length=0 -x 日本", "length=0 last"]
-    assert [scripted.goal(each)["text"] for each in ids] == said
-    assert scripted.watcher.texts("ACTIVE") == said
-    for words in ([], ["-f"], ["-w", "--json"]):
-        done = scripted.run("say", "--lines", *words, stdin="\n\r\n")
-        assert (done.code, done.out, done.err) == (0, "", ""), "nothing to say is success"
+    texts = ["length=0 one", "length=0 two", "length=0 -x 日本", "length=0 last"]
+    assert [scripted.goal(goal_id)["text"] for goal_id in ids] == texts
+    assert scripted.watcher.texts("ACTIVE") == texts
+    for options in ([], ["-f"], ["-w", "--json"]):
+        done = scripted.run("say", "--lines", *options, stdin="\n\r\n")
+        assert (done.code, done.out, done.err) == (0, "", ""), "empty input is a success"
 
 
 def test_endless_input_is_spoken_line_by_line(scripted: Talk) -> None:
@@ -90,29 +90,29 @@ def test_options_apply_to_each_line_with_the_remaining_ttl(scripted: Talk) -> No
     options = ("--as", "reader", "--priority", "3", "--ttl", "9", "--ahead", "1")
     text = "length=0.5 one\n\0\nlength=0 two\nlength=0 three\n"
     done = scripted.run("--json", "say", "--lines", *options, stdin=text)
-    goals = [json.loads(each) for each in done.out.splitlines()]
-    assert [each["state"] for each in goals] == ["PENDING", "REJECTED", "PENDING", "PENDING"]  # as accepted
+    goals = [json.loads(line) for line in done.out.splitlines()]
+    assert [goal["state"] for goal in goals] == ["PENDING", "REJECTED", "PENDING", "PENDING"]  # the first state
     goals.pop(1)
-    assert [(each["priority"], each["client"]["name"]) for each in goals] == [(3, "reader")] * 3
-    first, second, third = [each["ttl"] for each in goals]
+    assert [(goal["priority"], goal["client"]["name"]) for goal in goals] == [(3, "reader")] * 3
+    first, second, third = [goal["ttl"] for goal in goals]
     assert 9 >= first >= second > third
     assert third <= 8.5
     ended = scripted.run("--json", "say", "--lines", "-w", "--key", "k", stdin="length=0\nfail=audio_lost\n")
-    goals = [json.loads(each) for each in ended.out.splitlines()]
-    assert {each["key"] for each in goals} == {"k"}
+    goals = [json.loads(line) for line in ended.out.splitlines()]
+    assert {goal["key"] for goal in goals} == {"k"}
     assert (goals[-1]["state"], ended.code) == ("ABORTED", 4)
 
 
 def test_a_refused_line_is_reported_by_number_and_the_rest_is_spoken(scripted: Talk) -> None:
-    widest = "\N{GRINNING FACE}" * 10_000  # the most bytes that a text may have, beside the end of its line
+    widest = "\N{GRINNING FACE}" * 10_000  # the longest text in bytes, without its line end
     lines = ["length=0 one", "", "nul \0", "length=0 two", "x" * 10_001, "y" * 300_000, "length=0 three"]
     text = "\n".join([*lines, f"{widest}\r", f"{widest}a\r\n"])
     done = scripted.run("say", "--lines", stdin=text)
     assert (done.code, len(done.out.split())) == (5, 4)
     notes = done.err.splitlines()
-    assert [each.split(":")[1] for each in notes] == [" line 3", " line 5", " line 6", " line 9"]
-    for note, words in zip(notes, ("NUL", "10,001 characters", "300,000 bytes", "40,002 bytes"), strict=True):
-        assert words in note
+    assert [line.split(":")[1] for line in notes] == [" line 3", " line 5", " line 6", " line 9"]
+    for note, excerpt in zip(notes, ("NUL", "10,001 characters", "300,000 bytes", "40,002 bytes"), strict=True):
+        assert excerpt in note
     quiet = scripted.run("-q", "say", "--lines", stdin=text)
     assert (quiet.code, quiet.out, quiet.err) == (5, "", "")
 
@@ -120,17 +120,17 @@ def test_a_refused_line_is_reported_by_number_and_the_rest_is_spoken(scripted: T
 def test_a_line_with_invalid_utf8_is_reported_and_spoken(scripted: Talk) -> None:
     data = b"length=0 one\n\nlength=0 t\xffw\xfeo\n\xff\nlength=0 three\xc3"
     done, quiet = (
-        subprocess.run([*TALK, *words], env=scripted.env, input=data, capture_output=True, timeout=60, check=False)
-        for words in (["say", "--lines", "--wait"], ["-q", "say", "--lines"])
+        subprocess.run([*TALK, *arguments], env=scripted.env, input=data, capture_output=True, timeout=60, check=False)
+        for arguments in (["say", "--lines", "--wait"], ["-q", "say", "--lines"])
     )
     assert (done.returncode, len(done.stdout.split())) == (0, 4)
     assert done.stderr.decode().splitlines() == [
-        "talk: line 3, column 11: the byte 0xff is not valid UTF-8, so it is not spoken (1 more like it)",
-        "talk: line 4, column 1: the byte 0xff is not valid UTF-8, so it is not spoken",
-        "talk: line 5, column 15: the byte 0xc3 is not valid UTF-8, so it is not spoken",
+        "talk: line 3, column 11: the byte 0xff is not valid UTF-8 and is skipped (1 more like it)",
+        "talk: line 4, column 1: the byte 0xff is not valid UTF-8 and is skipped",
+        "talk: line 5, column 15: the byte 0xc3 is not valid UTF-8 and is skipped",
     ]
-    said = ["length=0 one", "length=0 t\ufffdw\ufffdo", "\ufffd", "length=0 three\ufffd"]
-    assert scripted.watcher.texts("ACTIVE")[:4] == said
+    texts = ["length=0 one", "length=0 t\ufffdw\ufffdo", "\ufffd", "length=0 three\ufffd"]
+    assert scripted.watcher.texts("ACTIVE")[:4] == texts
     assert quiet.stderr == b""
 
 
@@ -149,69 +149,69 @@ def test_wait_reports_failures_and_exits_with_the_first_one(scripted: Talk) -> N
 def test_feedback_shows_the_events_of_all_lines(scripted: Talk) -> None:
     done = scripted.run("say", "--lines", "-f", stdin="length=0.1 a\nlength=0.1 b\n")
     assert done.code == 0
-    shown = [each.split(" ", 1) for each in done.out.splitlines()]
-    assert [each for _, each in shown] == [
+    shown = [line.split(" ", 1) for line in done.out.splitlines()]
+    assert [event for _, event in shown] == [
         "PENDING", "ACTIVE", "word 1 0-10 0.000 length=0.1", "word 2 11-12 0.050 a", "SUCCEEDED",
         "PENDING", "ACTIVE", "word 1 0-10 0.000 length=0.1", "word 2 11-12 0.050 b", "SUCCEEDED",
     ]  # fmt: skip
     as_objects = scripted.run("--json", "say", "--lines", "-f", stdin="length=0\n\0\n")
-    found = [json.loads(each) for each in as_objects.out.splitlines()]
-    assert [each["goal"]["state"] for each in found if each["event"] == "result"].count("REJECTED") == 1
-    assert {"word", "state", "result"} == {each["event"] for each in found}
+    events = [json.loads(line) for line in as_objects.out.splitlines()]
+    assert [event["goal"]["state"] for event in events if event["event"] == "result"].count("REJECTED") == 1
+    assert {"word", "state", "result"} == {event["event"] for event in events}
 
 
-@pytest.mark.parametrize(("words", "ahead"), [([], 10), (["--ahead", "2", "--wait"], 2)])
-def test_few_lines_are_pending_so_that_others_have_room(scripted: Talk, words: list[str], ahead: int) -> None:
-    typing = Typing(scripted, "say", "--lines", *words)
+@pytest.mark.parametrize(("options", "ahead"), [([], 10), (["--ahead", "2", "--wait"], 2)])
+def test_few_lines_are_pending_so_that_others_have_room(scripted: Talk, options: list[str], ahead: int) -> None:
+    typing = Typing(scripted, "say", "--lines", *options)
     lines = [ENDLESS.rstrip(), *(f"length=0 {number}" for number in range(20))]
     typing.type("\n".join(lines))
     ids = [typing.line() for _ in range(ahead + 1)]
     scripted.watcher.wait_for_word(ids[0])
-    theirs = scripted.run("say", "length=0 theirs").id
+    other = scripted.run("say", "length=0 other").id
     scripted.run("cancel", ids[0])
-    scripted.watcher.wait_for_terminal(theirs)
+    scripted.watcher.wait_for_terminal(other)
     typing.end()
     scripted.watcher.wait_until(lambda _: len(scripted.watcher.texts("SUCCEEDED")) == len(lines))
-    assert scripted.watcher.texts("PENDING") == [*lines[: ahead + 1], "length=0 theirs", *lines[ahead + 1 :]]
+    assert scripted.watcher.texts("PENDING") == [*lines[: ahead + 1], "length=0 other", *lines[ahead + 1 :]]
 
 
 def test_a_line_replaces_a_pending_line_with_its_key_despite_the_limit(scripted: Talk) -> None:
     typing = Typing(scripted, "say", "--lines", "--key", "k", "--ahead", "1")
     typing.type(ENDLESS + "length=0 old\nlength=0 older\nlength=0 new\n")
     ids = [typing.line() for _ in range(4)]
-    assert [scripted.goal(each)["state"] for each in ids] == ["ACTIVE", "RECALLED", "RECALLED", "PENDING"]
+    assert [scripted.goal(goal_id)["state"] for goal_id in ids] == ["ACTIVE", "RECALLED", "RECALLED", "PENDING"]
     assert typing.end()[0] == 0
 
 
 @pytest.mark.parametrize(
-    ("words", "code"), [([], 0), (["-q", "--wait"], 6), (["--json", "--wait"], 6), (["--ttl=0"], 0)]
+    ("options", "code"), [([], 0), (["-q", "--wait"], 6), (["--json", "--wait"], 6), (["--ttl=0"], 0)]
 )
-def test_lines_whose_ttl_expires_while_they_wait_are_dropped(make_talk: MakeTalk, words: list[str], code: int) -> None:
+def test_lines_whose_ttl_expires_are_dropped(make_talk: MakeTalk, options: list[str], code: int) -> None:
     talk = make_talk("--max-queue", "1", scripted=True)
-    theirs = [talk.run("say", each).id for each in (ENDLESS, "never-ends")]
-    talk.watcher.wait_for_word(theirs[0])
-    began = time.monotonic()
-    typing = Typing(talk, "say", "--lines", "--ttl", "0.3", *words)
+    others = [talk.run("say", text).id for text in (ENDLESS, "never-ends")]
+    talk.watcher.wait_for_word(others[0])
+    started_at = time.monotonic()
+    typing = Typing(talk, "say", "--lines", "--ttl", "0.3", *options)
     typing.type("length=0 one\nlength=0 two\nlength=0 three\n")
-    if "--ttl=0" in words or "-q" in words:
-        time.sleep(0.4)  # nothing tells that time passes
+    if "--ttl=0" in options or "-q" in options:
+        time.sleep(0.4)  # no event to wait for
     else:
         notes: list[str] = []
-        while len(notes) < 2:  # with --wait, other lines tell how the line that was sent ended
-            notes += [each for each in [typing.errors.readline()] if "was not sent" in each or not each]
-        assert time.monotonic() - began >= 0.3
+        while len(notes) < 2:  # with --wait, other notes report the result of the sent line
+            notes += [line for line in [typing.errors.readline()] if "was not sent" in line or not line]
+        assert time.monotonic() - started_at >= 0.3
         assert notes == [f"talk: line {number} was not sent: its ttl of 0.3 s is over\n" for number in (2, 3)]
-    talk.run("cancel", *theirs)
-    found, out, err = typing.end()
-    assert (found, "was not sent" in err) == (code, False)
+    talk.run("cancel", *others)
+    exit_code, out, err = typing.end()
+    assert (exit_code, "was not sent" in err) == (code, False)
     assert talk.run("wait").code == 0
     assert talk.watcher.texts("ACTIVE")[1:] == (
-        [f"length=0 {each}" for each in ("one", "two", "three")] if "--ttl=0" in words else []
-    )  # the first line waited for room at the server, which counts, too
-    if "--json" in words:
-        goals = [json.loads(each) for each in out]
-        assert sorted((each["state"], each["reason"], each["text"]) for each in goals) == [
-            ("RECALLED", "expired", f"length=0 {each}") for each in ("one", "three", "two")
+        [f"length=0 {word}" for word in ("one", "two", "three")] if "--ttl=0" in options else []
+    )  # the ttl includes the time that the first line waited for room
+    if "--json" in options:
+        goals = [json.loads(line) for line in out]
+        assert sorted((goal["state"], goal["reason"], goal["text"]) for goal in goals) == [
+            ("RECALLED", "expired", f"length=0 {word}") for word in ("one", "three", "two")
         ]
 
 
@@ -220,7 +220,7 @@ def test_a_line_is_spoken_after_a_long_pause_in_the_input(scripted: Talk) -> Non
     typing = Typing(scripted, "say", "--lines")
     typing.type("length=0 one\n")
     scripted.watcher.wait_for(typing.line(), "SUCCEEDED")
-    time.sleep(SILENCE_LIMIT_S + 1)  # the server needn't show that it is alive
+    time.sleep(SILENCE_LIMIT_S + 1)  # an idle server doesn't report that it is alive
     typing.type("length=0 two\n")
     scripted.watcher.wait_for(typing.line(), "SUCCEEDED")
     assert typing.end()[0] == 0
@@ -230,17 +230,17 @@ def test_a_line_is_spoken_after_a_long_pause_in_the_input(scripted: Talk) -> Non
 def test_fast_input_is_spoken_within_its_ttl_and_delays_no_other_client(scripted: Talk) -> None:
     ttl, seconds, typed = 1.0, 2, {}
     typing = Typing(scripted, "-q", "say", "--lines", "--ttl", f"{ttl}")
-    began = time.monotonic()
+    started_at = time.monotonic()
     for number in range(50 * seconds):
-        time.sleep(max(0.0, began + number / 50 - time.monotonic()))
+        time.sleep(max(0.0, started_at + number / 50 - time.monotonic()))
         typed[f"length=0.3 {number}"] = time.time()
         typing.type(f"length=0.3 {number}\n")
         if number == 50:
-            theirs = scripted.start("say", "--wait", "length=0 theirs")
-    assert scripted.finish(theirs).code == 0
+            other_client = scripted.start("say", "--wait", "length=0 other")
+    assert scripted.finish(other_client).code == 0
     assert typing.end()[0] == 0
     assert scripted.run("wait").code == 0
-    goals = [each["goal"] for each in scripted.watcher.events() if each.get("state") == "SUCCEEDED"]
+    goals = [event["goal"] for event in scripted.watcher.events() if event.get("state") == "SUCCEEDED"]
     ages = [goal["started_at"] - typed[goal["text"]] for goal in goals if goal["text"] in typed]
     assert len(ages) > 2 * seconds
     assert_within(max(ages), ttl + 0.2, "the oldest line that is spoken")
@@ -248,9 +248,9 @@ def test_fast_input_is_spoken_within_its_ttl_and_delays_no_other_client(scripted
     assert_within(other["started_at"] - other["queued_at"], 1, "the other client's sentence")
 
 
-@pytest.mark.parametrize(("words", "most"), [(["--ttl", "60"], 1_000_000), ([], 0)])
-def test_only_as_much_input_is_read_as_can_be_kept(scripted: Talk, words: list[str], most: int) -> None:
-    client = Forked(["say", "--lines", *words], scripted.env, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
+@pytest.mark.parametrize(("options", "most"), [(["--ttl", "60"], 1_000_000), ([], 0)])
+def test_only_as_much_input_is_read_as_can_be_kept(scripted: Talk, options: list[str], most: int) -> None:
+    client = Forked(["say", "--lines", *options], scripted.env, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
     assert client.stdin
     pipe = client.stdin.fileno()
     os.write(pipe, ENDLESS.encode())
@@ -260,7 +260,7 @@ def test_only_as_much_input_is_read_as_can_be_kept(scripted: Talk, words: list[s
     with client:
         while room.poll(10_000 if written < most else 500):
             written += os.write(pipe, b"length=0 line\n" * 1_000)
-            assert written < most + 400_000  # what the pipe holds, and what is read at once, come on top
+            assert written < most + 400_000  # the pipe and the read buffer hold more
         assert written >= most
         client.kill()
         client.wait(10)
@@ -269,7 +269,7 @@ def test_only_as_much_input_is_read_as_can_be_kept(scripted: Talk, words: list[s
 def test_lines_wait_for_room_and_none_is_lost(make_talk: MakeTalk) -> None:
     talk = make_talk("--max-queue", "3", scripted=True)
     lines = [f"length=0.02 {number}" for number in range(30)]
-    done = talk.run("say", "--lines", stdin="".join(f"{each}\n" for each in lines))
+    done = talk.run("say", "--lines", stdin="".join(f"{line}\n" for line in lines))
     assert (done.code, done.err, len(set(done.out.split()))) == (0, "", len(lines))
     talk.watcher.wait_for_terminal(done.out.split()[-1])
     assert talk.watcher.texts("SUCCEEDED") == lines
@@ -280,7 +280,7 @@ def test_several_hundred_lines_are_spoken_per_second(make_talk: MakeTalk) -> Non
     lines = [f"length=0 {number}" for number in range(600)]
     with limits():
         done = talk.run("say", "--lines", "--wait", stdin="\n".join(lines))
-        assert_within(done.seconds, 3.0, f"{len(lines)} lines")  # one second on an idle machine
+        assert_within(done.seconds, 3.0, f"{len(lines)} lines")  # takes one second on an idle machine
     assert (done.code, len(done.out.split())) == (0, len(lines))
 
 
@@ -301,44 +301,44 @@ def test_an_endless_line_is_read_with_bounded_memory(scripted: Talk) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_a_signal_cancels_only_the_clients_own_goals(make_talk: MakeTalk, number: signal.Signals) -> None:
     talk = make_talk("--max-queue", "4", scripted=True)
-    theirs = talk.run("say", "--priority", "-1", "length=0 theirs").id
-    talk.watcher.wait_for_terminal(theirs)
+    other = talk.run("say", "--priority", "-1", "length=0 other").id
+    talk.watcher.wait_for_terminal(other)
     typing = Typing(talk, "say", "--lines", "--wait")
     typing.type(ENDLESS + "second\nthird\n")
     ids = [typing.line() for _ in range(3)]
-    theirs = talk.run("say", "length=0 theirs").id
+    other = talk.run("say", "length=0 other").id
     talk.watcher.wait_for_word(ids[0])
-    began = time.monotonic()
+    started_at = time.monotonic()
     code, out, err = typing.end(number)
-    assert time.monotonic() - began < 3
+    assert time.monotonic() - started_at < 3
     assert (code, out) == (128 + number, [])
     assert f"talk: {ids[0]}: Talk preempted" in err
     assert "removed 2 waiting lines from the queue" in err
-    assert [talk.watcher.wait_for_terminal(each) for each in ids] == ["PREEMPTED", "RECALLED", "RECALLED"]
-    assert talk.watcher.wait_for_terminal(theirs) == "SUCCEEDED"
+    assert [talk.watcher.wait_for_terminal(goal_id) for goal_id in ids] == ["PREEMPTED", "RECALLED", "RECALLED"]
+    assert talk.watcher.wait_for_terminal(other) == "SUCCEEDED"
     assert talk.watcher.states(ids[2]) == ["PENDING", "RECALLED"]
-    typing = Typing(talk, "say", "--lines")  # without --wait, its goals go on
+    typing = Typing(talk, "say", "--lines")  # without --wait, its goals continue
     typing.type(f"{ENDLESS}\nsecond\n")
     ids = [typing.line() for _ in range(2)]
     assert typing.end(number) == (128 + number, [], "")
     assert talk.goal(ids[1])["state"] == "PENDING"
 
 
-@pytest.mark.parametrize("words", [["--json", "--wait"], ["-f"]])
-def test_a_line_that_waits_for_room_is_not_spoken_after_a_signal(make_talk: MakeTalk, words: list[str]) -> None:
+@pytest.mark.parametrize("options", [["--json", "--wait"], ["-f"]])
+def test_a_line_that_waits_for_room_is_not_spoken_after_a_signal(make_talk: MakeTalk, options: list[str]) -> None:
     talk = make_talk("--max-queue", "1", scripted=True)
-    typing = Typing(talk, "say", "--lines", *words)
+    typing = Typing(talk, "say", "--lines", *options)
     typing.type(ENDLESS + "second\nthird\nfourth\n")
-    talk.watcher.wait_until(lambda each: bool(each.get("goal")) and each["goal"]["text"] == "second")
-    # The client may not know of it yet, and the third line causes no event.
+    talk.watcher.wait_until(lambda event: bool(event.get("goal")) and event["goal"]["text"] == "second")
+    # The client may not have its reply yet, and the third line causes no event.
     code, out, err = typing.end(signal.SIGINT)
     assert code == 130
     assert re.search("line [23] may not have been accepted, and the lines after it were not sent", err)
     assert talk.watcher.texts("ACTIVE") == [ENDLESS.rstrip()]
     assert talk.watcher.texts("PENDING")[:2] == [ENDLESS.rstrip(), "second"]
-    if "--json" in words:
-        last = [json.loads(each) for each in out][-2:]
-        states = [each["goal"]["state"] if "event" in each else each["state"] for each in last]
+    if "--json" in options:
+        last = [json.loads(line) for line in out][-2:]
+        states = [result["goal"]["state"] if "event" in result else result["state"] for result in last]
         assert sorted(states) == ["PREEMPTED", "RECALLED"]
     assert talk.run("--json", "status").out.count('"PENDING"') == 0
 
@@ -351,26 +351,26 @@ def test_the_timeout_applies_to_all_lines_together(scripted: Talk) -> None:
     assert code == 124
     assert "Talk preempted" in err
     assert err.splitlines()[-1] == "talk: timed out after 0.5 s"
-    assert [scripted.watcher.wait_for_terminal(each) for each in ids] == ["PREEMPTED", "RECALLED"]
-    began = time.monotonic()
+    assert [scripted.watcher.wait_for_terminal(goal_id) for goal_id in ids] == ["PREEMPTED", "RECALLED"]
+    started_at = time.monotonic()
     silent = Typing(scripted, "say", "--lines", "-w", "-t", "0.2")
-    assert silent.client.wait(10) == 124  # with nothing to read, and nothing to wait for
-    assert time.monotonic() - began >= 0.2
+    assert silent.client.wait(10) == 124  # without any input or goals
+    assert time.monotonic() - started_at >= 0.2
     assert scripted.run("say", "--lines", "-w", "-t", "1e300", stdin="length=0\n").code == 0
 
 
-@pytest.mark.parametrize("words", [[], ["-f"]])
-def test_the_client_exits_if_the_server_goes_away(scripted: Talk, words: list[str]) -> None:
-    typing = Typing(scripted, "say", "--lines", *words)
+@pytest.mark.parametrize("options", [[], ["-f"]])
+def test_the_client_exits_if_the_server_goes_away(scripted: Talk, options: list[str]) -> None:
+    typing = Typing(scripted, "say", "--lines", *options)
     typing.type(ENDLESS)
     first = typing.line().split()[0]
     scripted.watcher.wait_for_word(first)
     scripted.kill()
-    assert typing.client.wait(10) == (12 if words else 3)
+    assert typing.client.wait(10) == (12 if options else 3)
     _, out, err = typing.end()
     assert "lost the connection to the server" in err
-    assert ("may still be spoken" in err) == bool(words)
-    assert [each for each in out if "LOST" in each] == ([f"{first} LOST"] if words == ["-f"] else [])
+    assert ("may still be spoken" in err) == bool(options)
+    assert [line for line in out if "LOST" in line] == ([f"{first} LOST"] if options == ["-f"] else [])
 
 
 def test_a_lost_idle_server_is_reported_with_the_next_line(scripted: Talk) -> None:
@@ -380,7 +380,7 @@ def test_a_lost_idle_server_is_reported_with_the_next_line(scripted: Talk) -> No
     scripted.kill()
     typing.type("into the void\n")
     code, _, err = typing.end()
-    assert code == 5  # that of the first line that failed
+    assert code == 5  # for the first line that failed
     assert "line 2 may not have been accepted" in err
 
 
@@ -397,19 +397,20 @@ def test_a_missing_server_is_reported_before_input_is_read() -> None:
         assert b"talk serve" in err
 
 
-def piped(talk: Talk, *words: str, read: bool = True) -> tuple[Forked, int]:
-    """Start `say --lines` with its output in a pipe, and return it with the reading end, which may be closed."""
+def piped(talk: Talk, *arguments: str, read: bool = True) -> tuple[Forked, int]:
+    """Start `say --lines` with a pipe as its output. Return it with the reading end, which is closed unless `read`."""
     reader, writer = os.pipe()
     if not read:
         os.close(reader)
-    client = Forked(["say", "--lines", *words], talk.env, stdin=subprocess.PIPE, stdout=writer, stderr=subprocess.PIPE)
+    command = ["say", "--lines", *arguments]
+    client = Forked(command, talk.env, stdin=subprocess.PIPE, stdout=writer, stderr=subprocess.PIPE)
     os.close(writer)
     return client, reader
 
 
-@pytest.mark.parametrize(("words", "read"), [([], False), (["-f"], False), ([], True)])
-def test_lines_are_spoken_if_the_reader_of_their_ids_has_gone(scripted: Talk, words: list[str], read: bool) -> None:
-    client, reader = piped(scripted, *words, read=read)
+@pytest.mark.parametrize(("options", "read"), [([], False), (["-f"], False), ([], True)])
+def test_lines_are_spoken_if_the_reader_of_their_ids_has_gone(scripted: Talk, options: list[str], read: bool) -> None:
+    client, reader = piped(scripted, *options, read=read)
     assert client.stdin
     client.stdin.write("length=0 a\n")
     client.stdin.flush()
@@ -421,28 +422,30 @@ def test_lines_are_spoken_if_the_reader_of_their_ids_has_gone(scripted: Talk, wo
     scripted.watcher.wait_until(lambda _: scripted.watcher.texts("SUCCEEDED") == ["length=0 a", "length=0 b"])
 
 
-@pytest.mark.parametrize(("words", "ended"), [(["--wait"], True), (["--wait", "--json"], False), (["-f"], False)])
-def test_the_clients_goals_are_cancelled_if_its_reader_goes_away(scripted: Talk, words: list[str], ended: bool) -> None:
-    client, reader = piped(scripted, *words)
+@pytest.mark.parametrize(("options", "ended"), [(["--wait"], True), (["--wait", "--json"], False), (["-f"], False)])
+def test_goals_are_cancelled_if_the_reader_goes_away(scripted: Talk, options: list[str], ended: bool) -> None:
+    client, reader = piped(scripted, *options)
     with client:
         assert client.stdin
         client.stdin.write(f"{ENDLESS}second\n")
         client.stdin.flush()
-        second = scripted.watcher.wait_until(lambda each: bool(each.get("goal")) and each["goal"]["text"] == "second")
+        second = scripted.watcher.wait_until(lambda event: (event.get("goal") or {}).get("text") == "second")
         first = scripted.watcher.goals()[0]
         scripted.watcher.wait_for_word(first)
         if ended:
             client.stdin.close()
         os.close(reader)
         assert client.wait(10) == 141
-    assert [scripted.watcher.wait_for_terminal(each) for each in (first, second["id"])] == ["PREEMPTED", "RECALLED"]
+    assert scripted.watcher.wait_for_terminal(first) == "PREEMPTED"
+    assert scripted.watcher.wait_for_terminal(second["id"]) == "RECALLED"
 
 
 def test_an_unreadable_standard_input_is_reported(scripted: Talk) -> None:
-    for words in (["--lines"], ["-"]):
+    for arguments in (["--lines"], ["-"]):
         with open(os.devnull, "wb") as write_only:
+            command = [*TALK, "say", *arguments]
             done = subprocess.run(
-                [*TALK, "say", *words], env=scripted.env, stdin=write_only, capture_output=True, timeout=20, check=False
+                command, env=scripted.env, stdin=write_only, capture_output=True, timeout=20, check=False
             )
         assert (done.returncode, done.stdout) == (2, b"")
         assert b"can't read standard input: Bad file descriptor" in done.stderr

@@ -1,4 +1,4 @@
-"""The options of `say` do what its help says. Contradictions are refused before anything is sent."""
+"""The options of `say`. Contradictions are refused before anything is sent."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def busy(talk: Talk) -> str:
-    """Start a goal that does not end, and return its id once it is heard."""
+    """Start a goal that doesn't end, and return its id when its first word is heard."""
     goal_id = talk.run("say", "never-ends words=1").id
     talk.watcher.wait_for_word(goal_id)
     return goal_id
@@ -52,7 +52,7 @@ def test_markdown_is_spoken_without_its_marks(make_talk: MakeTalk, tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    ("words", "hints"),
+    ("arguments", "hints"),
     [
         (["--lines", "-"], ["--lines", "TEXT"]),
         (["--lines", "--id", "mine"], ["--lines", "--id"]),
@@ -71,27 +71,27 @@ def test_markdown_is_spoken_without_its_marks(make_talk: MakeTalk, tmp_path: Pat
         (["--lead-in", "5001", "hello"], ["--lead-in", "5000"]),
     ],
 )
-def test_contradictions_and_values_out_of_range_are_usage_errors(words: list[str], hints: list[str]) -> None:
-    """`tests/golden/errors.txt` has many more."""
-    done = alone("say", *words)
+def test_contradictions_and_values_out_of_range_are_usage_errors(arguments: list[str], hints: list[str]) -> None:
+    """`tests/golden/errors.txt` has many more cases."""
+    done = alone("say", *arguments)
     assert (done.code, done.out) == (2, ""), done
-    assert [each for each in hints if each not in done.err] == [], done.err
+    assert [hint for hint in hints if hint not in done.err] == [], done.err
 
 
 def test_preempt_queue_flush_and_priority_reach_the_server(make_talk: MakeTalk) -> None:
     talk = make_talk("--preempt", scripted=True)
     first = busy(talk)
-    queued = [talk.run("say", "--queue", "--priority", each, "length=0").id for each in ("-1", "0", "5")]
-    assert [talk.watcher.states(each) for each in queued] == [["PENDING"]] * 3
+    queued = [talk.run("say", "--queue", "--priority", priority, "length=0").id for priority in ("-1", "0", "5")]
+    assert [talk.watcher.states(goal_id) for goal_id in queued] == [["PENDING"]] * 3
     assert talk.run("say", "--wait", "--preempt", "--priority", "9", "length=0").code == 0
     assert talk.watcher.wait_for_terminal(first) == "PREEMPTED"
-    assert {talk.watcher.wait_for_terminal(each) for each in queued} == {"SUCCEEDED"}
-    begun = [each["id"] for each in talk.watcher.events() if each.get("state") == "ACTIVE"]
-    assert begun[2:] == queued[::-1]
+    assert {talk.watcher.wait_for_terminal(goal_id) for goal_id in queued} == {"SUCCEEDED"}
+    started = [event["id"] for event in talk.watcher.events() if event.get("state") == "ACTIVE"]
+    assert started[2:] == queued[::-1]
     first = busy(talk)
-    pending, important = (talk.run("say", "--queue", "--priority", each, "length=0").id for each in ("0", "1"))
+    pending, important = (talk.run("say", "--queue", "--priority", priority, "length=0").id for priority in ("0", "1"))
     assert talk.run("say", "--wait", "--flush", "length=0 now").code == 0
-    ends = [talk.watcher.wait_for_terminal(each) for each in (first, pending, important)]
+    ends = [talk.watcher.wait_for_terminal(goal_id) for goal_id in (first, pending, important)]
     assert ends == ["PREEMPTED", "RECALLED", "SUCCEEDED"]
 
 
@@ -111,8 +111,8 @@ def test_expired_and_replaced_goals_exit_with_6(scripted: Talk) -> None:
 def test_a_throttled_goal_exits_with_0_and_prints_no_id(scripted: Talk) -> None:
     throttled = ["say", "--key", "battery", "--throttle", "60"]
     assert scripted.run(*throttled, "--wait", "length=0").code == 0
-    for words in ([], ["-f"]):
-        done = scripted.run(*throttled, *words, "length=0")
+    for options in ([], ["-f"]):
+        done = scripted.run(*throttled, *options, "length=0")
         assert (done.code, done.out) == (0, ""), done
         assert "less than 60 s ago" in done.err
         assert done.err.count("\n") == 1
@@ -142,7 +142,7 @@ def test_ctrl_c_while_the_text_is_read_prints_a_newline(scripted: Talk) -> None:
         client.stdin.write(b"battery")
         client.stdin.flush()
         while struct.unpack("i", fcntl.ioctl(client.stdin, termios.FIONREAD, bytes(4)))[0]:
-            time.sleep(0.005)  # no event tells that another process has read
+            time.sleep(0.005)  # no event reports that another process has read
         client.send_signal(signal.SIGINT)
         assert client.stderr
         assert client.stderr.read() == b"\n"
@@ -157,16 +157,16 @@ def test_the_lead_in_of_a_goal_is_not_part_of_its_duration(make_talk: MakeTalk) 
 
 
 def test_say_reports_that_speech_is_paused(scripted: Talk) -> None:
-    held = busy(scripted)
+    active = busy(scripted)
     assert scripted.run("pause").code == 0
     note = "talk: speech is paused; continue with: talk resume\n"
     assert scripted.run("say", "length=0").err == note
     assert scripted.run("say", "-q", "length=0").err == ""
     waiting = scripted.start("say", "-w", "length=0")
     assert waiting.stdout
-    assert waiting.stdout.readline()  # its id, before it is spoken
+    assert waiting.stdout.readline()  # the id is printed before the goal is spoken
     assert scripted.run("resume").code == 0
-    scripted.run("cancel", held)
+    scripted.run("cancel", active)
     ended = scripted.finish(waiting)
     assert (ended.code, ended.err) == (0, note)
     assert scripted.run("say", "length=0").err == ""
@@ -176,8 +176,8 @@ def test_a_goal_with_a_chosen_id_is_spoken_once(scripted: Talk) -> None:
     text = "fail=audio_lost message=no_cable"
     assert scripted.run("say", "--id", "dock-17a", text).out == "dock-17a\n"
     scripted.watcher.wait_for_terminal("dock-17a")
-    for words, out in (([], "dock-17a\n"), (["--wait", "-f"], "dock-17a ABORTED\n")):
-        done = scripted.run("say", "--id", "dock-17a", *words, text)  # its end is told without waiting
+    for options, out in (([], "dock-17a\n"), (["--wait", "-f"], "dock-17a ABORTED\n")):
+        done = scripted.run("say", "--id", "dock-17a", *options, text)  # the result is already known
         assert (done.code, done.out) == (4, out)
         assert done.err == "talk: dock-17a: speech failed: no cable; find out why with: talk doctor\n"
     goal = json.loads(scripted.run("--json", "say", "--id", "dock-17a", text).out)
@@ -189,7 +189,7 @@ def test_a_goal_with_a_chosen_id_is_spoken_once(scripted: Talk) -> None:
 
 @pytest.mark.parametrize("feedback", [[], ["-f"]])
 def test_an_attached_client_cancels_nothing(scripted: Talk, feedback: list[str]) -> None:
-    text = "never-ends length=60 " + "word " * 600  # one in a tenth of a second
+    text = "never-ends length=60 " + "word " * 600  # ten words per second
     scripted.run("say", "--id", "mine", text)
     scripted.watcher.wait_for_word("mine")
     late = scripted.run("say", "--wait", *feedback, "-t", "0.3", "--id", "mine", text)
@@ -212,31 +212,29 @@ def test_output_writes_a_file_without_a_server(tmp_path: Path) -> None:
     file = tmp_path / "said.wav"
     done = alone("say", "-o", str(file), "--", "battery", "low")
     assert (done.code, done.out, done.err) == (0, "", "")
-    with wave.open(str(file)) as found:
-        seconds = found.getnframes() / found.getframerate()
-    told = json.loads(alone("--json", "say", "-o", str(file), "battery low").out)
-    assert told["output"] == str(file)
-    assert told["text"] == "battery low"
+    with wave.open(str(file)) as audio:
+        seconds = audio.getnframes() / audio.getframerate()
+    report = json.loads(alone("--json", "say", "-o", str(file), "battery low").out)
+    assert report["output"] == str(file)
+    assert report["text"] == "battery low"
     with short_directory() as home:
         script = f'"$@" --json say -o {shlex.quote(str(file))} one >&-'
         done = run(["bash", "-c", script, "bash", *TALK], environment(home, TALK_SOCKET=f"{home}/s"))
         assert (done.code, done.err) == (0, "")
-    assert told["seconds"] == pytest.approx(seconds, abs=0.05)
+    assert report["seconds"] == pytest.approx(seconds, abs=0.05)
 
 
 def test_output_omits_and_reports_invalid_utf8_bytes(tmp_path: Path) -> None:
-    hidden = ".mp3"  # no ending
+    hidden = ".mp3"  # a hidden file without an extension
     for name, text in (("said.wav", "battery \udcfflow"), (hidden, "battery  low")):
         done = alone("say", "-o", str(tmp_path / name), "--", text, TALK_NAME="patrol")
         assert (done.code, done.out) == (0, "")
-        assert ("line 1, column 9: the byte 0xff is not valid UTF-8, so it is not spoken\n" in done.err) == (
-            "said" in name
-        )
+        assert ("line 1, column 9: the byte 0xff is not valid UTF-8 and is skipped\n" in done.err) == ("said" in name)
     assert (tmp_path / "said.wav").read_bytes() == (tmp_path / hidden).read_bytes()
 
 
-def _seconds_of(tmp_path: Path, *words: str, **env: str) -> float:
-    done = alone("--json", "say", "-o", str(tmp_path / "x.wav"), *words, "one two three four five six", **env)
+def _seconds_of(tmp_path: Path, *arguments: str, **env: str) -> float:
+    done = alone("--json", "say", "-o", str(tmp_path / "x.wav"), *arguments, "one two three four five six", **env)
     assert done.code == 0, done.err
     return float(json.loads(done.out)["seconds"])
 
@@ -251,30 +249,30 @@ def test_output_can_be_standard_output(tmp_path: Path) -> None:
         assert (gone.out, gone.err) == ("141\n", "")
         full = run(["bash", "-c", '"$@" say -o - one > /dev/full', "bash", *TALK], env)
         assert (full.code, full.err) == (1, "talk: standard output cannot be written: No space left on device\n")
-    said = (tmp_path / "said.wav").read_bytes()
+    piped = (tmp_path / "said.wav").read_bytes()
     assert alone("say", "-o", str(tmp_path / "file.wav"), "battery low").code == 0
-    assert said[44:] == (tmp_path / "file.wav").read_bytes()[44:]
+    assert piped[44:] == (tmp_path / "file.wav").read_bytes()[44:]
     both = alone("--json", "say", "-o", "-", "x")
     assert (both.code, both.out) == (2, "")
     assert "standard output" in both.err
 
 
 def test_output_accepts_a_text_of_any_length(tmp_path: Path) -> None:
-    text = f"one {' ' * 45_000} two"  # more than a goal may have of characters, and of bytes
-    words = ["--json", "say", "-o", str(tmp_path / "x.wav"), "--rate", "450"]
+    text = f"one {' ' * 45_000} two"  # exceeds the limits of a goal in characters and in bytes
+    arguments = ["--json", "say", "-o", str(tmp_path / "x.wav"), "--rate", "450"]
     with short_directory() as home:
         by_input = subprocess.run(
-            [*TALK, *words, "-"], input=text, env=environment(home), capture_output=True, text=True, check=False
+            [*TALK, *arguments, "-"], input=text, env=environment(home), capture_output=True, text=True, check=False
         )
-    told = json.loads(by_input.stdout)
-    assert (by_input.returncode, told["text"]) == (0, text)
-    with wave.open(str(tmp_path / "x.wav")) as found:
-        assert found.getnframes() / found.getframerate() == pytest.approx(told["seconds"], abs=0.01)
+    report = json.loads(by_input.stdout)
+    assert (by_input.returncode, report["text"]) == (0, text)
+    with wave.open(str(tmp_path / "x.wav")) as audio:
+        assert audio.getnframes() / audio.getframerate() == pytest.approx(report["seconds"], abs=0.01)
 
 
 def test_the_error_for_a_long_text_suggests_lines(scripted: Talk) -> None:
-    for words, typed in ((["-"], "one two. " * 2000), (["-w", "-"], "x" * 50_000), (["-w", "x" * 10_001], None)):
-        done = scripted.run("say", *words, stdin=typed)
+    for arguments, typed in ((["-"], "one two. " * 2000), (["-w", "-"], "x" * 50_000), (["-w", "x" * 10_001], None)):
+        done = scripted.run("say", *arguments, stdin=typed)
         assert (done.code, done.out) == (5, "")
         assert "10,000" in done.err
         assert "talk say --lines" in done.err
@@ -296,13 +294,13 @@ def test_output_prefers_options_to_environment_variables(tmp_path: Path) -> None
 
 
 def test_a_failed_output_reports_an_error_and_leaves_no_file(tmp_path: Path) -> None:
-    for words, code in (
+    for arguments, code in (
         (["-o", f"{tmp_path}/no/x.wav", "hello"], 1),
         (["-o", str(tmp_path), "hello"], 2),
         (["-o", f"{tmp_path}/x.wav", ""], 5),
         (["-o", f"{tmp_path}/x.wav", "-t", "0.001", "hello"], 124),
     ):
-        done = alone("say", *words)
+        done = alone("say", *arguments)
         assert (done.code, done.out) == (code, ""), done
         assert done.err
     assert os.listdir(tmp_path) == []
@@ -314,7 +312,7 @@ def test_an_interrupted_output_leaves_no_file(tmp_path: Path) -> None:
             [*TALK, "say", "-o", str(tmp_path / "x.wav"), "--rate", "80", "--", "one two three. " * 600],
             env=environment(home),
         )
-        while not os.listdir(tmp_path):  # the hidden file appears when the engine starts
+        while not os.listdir(tmp_path):  # a hidden file appears when the engine starts
             assert client.poll() is None
             time.sleep(0.005)
         client.send_signal(signal.SIGINT)

@@ -1,4 +1,4 @@
-"""`say -wf` and `wait -f` on a terminal light up each word as it is heard, and leave the line whole."""
+"""`say -wf` and `wait -f` on a terminal highlight each word as it is heard, and leave the whole line."""
 
 from __future__ import annotations
 
@@ -20,38 +20,38 @@ if TYPE_CHECKING:
 
     Run = Callable[..., Terminal]
 
-#: Attributes of a cell: the word being heard, and the words after it.
+#: Attributes of cells: the current word, and the words after it.
 LIT, AHEAD = "7", "2"
 
 
 @pytest.fixture
 def in_terminal(scripted: Talk) -> Iterator[Run]:
-    """Runs `talk` in a terminal: `in_terminal("say", "-wf", "--", text, columns=40)`."""
+    """Return a function that runs `talk` in a terminal: `in_terminal("say", "-wf", "--", text, columns=40)`."""
     opened: list[Terminal] = []
 
-    def start(*words: str, columns: int = 80, **env: str) -> Terminal:
-        opened.append(Terminal([*TALK, *words], {**scripted.env, **env}, columns))
+    def start(*arguments: str, columns: int = 80, **env: str) -> Terminal:
+        opened.append(Terminal([*TALK, *arguments], {**scripted.env, **env}, columns))
         return opened[-1]
 
     yield start
-    for each in opened:
-        each.close()
+    for terminal in opened:
+        terminal.close()
 
 
 def painted(terminal: Terminal, columns: int = 80) -> Iterator[Screen]:
-    """Draw again what was written, and yield the screen after each painting."""
+    """Draw the terminal's output again, and yield the screen after each redraw."""
     screen = Screen(columns)
-    before, *paintings = terminal.raw.decode().split("\r\x1b[2K")
+    before, *redraws = terminal.raw.decode().split("\r\x1b[2K")
     screen.draw(before)
-    for each in paintings:
-        screen.draw(f"\r\x1b[2K{each}")
+    for text in redraws:
+        screen.draw(f"\r\x1b[2K{text}")
         yield screen
 
 
 def test_each_word_is_highlighted_while_it_is_heard(scripted: Talk, in_terminal: Run) -> None:
     text = "length=0.4 battery low now"
     terminal = in_terminal("say", "-wf", "--", text)
-    terminal.wait_until(lambda screen: bool(screen.marked(LIT)))  # while the rest is still to come
+    terminal.wait_until(lambda screen: bool(screen.marked(LIT)))  # before the rest is heard
     assert terminal.finish() == 0
     seen: list[str] = []
     for screen in painted(terminal):
@@ -79,24 +79,24 @@ def test_a_long_text_scrolls_and_is_shown_whole_at_the_end(scripted: Talk, in_te
             lit.append(screen.marked(LIT))
             assert screen.wraps == 0
     assert lit[-1] == words[-1]
-    assert set(words) & set(lit) == set(lit) - {"length=1"}  # each whole, never cut
+    assert set(words) & set(lit) == set(lit) - {"length=1"}  # words are never cut
     assert len(set(lit)) > 20
     goal_id = scripted.watcher.goals()[0]
     whole = f"{goal_id}  SUCCEEDED  {text}"
-    assert "".join(each.ljust(50) for each in terminal.screen.lines).rstrip() == whole
+    assert "".join(line.ljust(50) for line in terminal.screen.lines).rstrip() == whole
 
 
 @pytest.mark.parametrize("columns", [5, 30])
 def test_wide_and_control_characters_do_not_break_the_line(in_terminal: Run, columns: int) -> None:
     text = "length=0.3 日本語の文章です a\x1b[31mred \u202egnp 👩👩👩👩 é é é の終わり\x07"
     terminal = in_terminal("say", "-wf", "--", text, columns=columns)
-    assert terminal.finish() == 0  # the screen fails at any control sequence but those of talk
+    assert terminal.finish() == 0  # the screen fails at unknown control sequences
     *before, _ = (screen.wraps for screen in painted(terminal, columns))
     assert len(before) > 3
     assert max(before) == 0
     assert terminal.screen.lines[-1] == ""
     shown = "".join(terminal.screen.lines)
-    assert "SUCCEEDED" in shown  # on two lines if the terminal is that narrow
+    assert "SUCCEEDED" in shown  # on two lines if the terminal is very narrow
     assert printable(text).replace(" ", "") in shown.replace(" ", "")
 
 
@@ -127,7 +127,7 @@ def test_a_pause_is_shown_and_ctrl_c_leaves_the_terminal_clean(scripted: Talk, i
     assert scripted.goal(goal_id)["state"] == "PREEMPTED"
     first, second, last = terminal.screen.lines
     assert first == f"{goal_id}  PREEMPTED  never-ends words=2 and so on"
-    assert terminal.screen.marked(AHEAD, 0) == " and so on"  # the words that were not heard
+    assert terminal.screen.marked(AHEAD, 0) == " and so on"  # the words that weren't heard
     assert second.startswith(f"talk: {goal_id}: Talk preempted")
     assert (last, terminal.screen.attributes) == ("", "")
 
@@ -161,7 +161,7 @@ def test_a_terminal_without_colour_gets_one_line_per_event(scripted: Talk, in_te
     assert terminal.finish() == 0
     goal_id = scripted.watcher.goals()[0]
     events = ["PENDING", "ACTIVE", "word 1 0-10 0.000 length=0.2", "word 2 11-14 0.100 low", "SUCCEEDED"]
-    assert terminal.screen.lines == [*(f"{goal_id} {each}" for each in events), ""]
+    assert terminal.screen.lines == [*(f"{goal_id} {event}" for event in events), ""]
     assert b"\x1b" not in terminal.raw
 
 
@@ -176,10 +176,10 @@ def test_wait_shows_the_active_goal_and_all_results(scripted: Talk, in_terminal:
     terminal.wait_until(lambda screen: f"{third}  RECALLED   length=0.3 third" in screen.lines)
     terminal.wait_until(lambda screen: screen.last == f"{first}  ACTIVE     never-ends words=1 first")
     scripted.run("cancel", first)
-    assert terminal.finish() == 6  # the first in order
-    shown = [each.split("  ")[0:2] for each in terminal.screen.lines[:3]]
+    assert terminal.finish() == 6  # the first goal's exit code
+    shown = [line.split("  ")[0:2] for line in terminal.screen.lines[:3]]
     assert shown == [[third, "RECALLED"], [first, "PREEMPTED"], [second, "SUCCEEDED"]]
-    assert [each[:5] for each in terminal.screen.lines[3:]] == ["talk:", "talk:", ""]
+    assert [line[:5] for line in terminal.screen.lines[3:]] == ["talk:", "talk:", ""]
 
 
 def test_typed_lines_are_highlighted_one_after_the_other(scripted: Talk, in_terminal: Run) -> None:
@@ -189,51 +189,51 @@ def test_typed_lines_are_highlighted_one_after_the_other(scripted: Talk, in_term
     terminal.resize(90)
     terminal.type(b"\0\nlength=0.1 two\n\x04")
     assert terminal.finish() == 5
-    first, second = (each for each in scripted.watcher.goals() if "ACTIVE" in scripted.watcher.states(each))
+    first, second = (goal for goal in scripted.watcher.goals() if "ACTIVE" in scripted.watcher.states(goal))
     lines = terminal.screen.lines
     assert f"{first}  SUCCEEDED  length=0.5 words=1 one" in lines
     assert f"{second}  SUCCEEDED  length=0.1 two" in lines
-    assert [each for each in lines if each.startswith("talk: line 2: ")] != []
+    assert [line for line in lines if line.startswith("talk: line 2: ")] != []
     assert lines[-1] == ""
     assert terminal.screen.attributes == ""
 
 
-def test_aborted_goals_refer_to_the_doctor_unless_their_texts_are_to_blame(scripted: Talk) -> None:
-    others = [f"fail={reason}" for reason in ("nothing_to_say", "text_stalled", "broken_off")]
-    for text, told in (("fail=audio_lost", True), ("length=0", False), *((each, False) for each in others)):
-        assert scripted.run("say", "--wait", "--", text).err.endswith("; find out why with: talk doctor\n") == told
+def test_aborted_goals_refer_to_the_doctor_unless_their_texts_are_the_cause(scripted: Talk) -> None:
+    causes = [f"fail={reason}" for reason in ("nothing_to_say", "text_stalled", "broken_off")]
+    for text, named in (("fail=audio_lost", True), ("length=0", False), *((cause, False) for cause in causes)):
+        assert scripted.run("say", "--wait", "--", text).err.endswith("; find out why with: talk doctor\n") == named
 
 
-# How a sentence is cut to the terminal
+# Cutting of long sentences
 
 
 LONG = "the quick brown fox jumps over the lazy dog"
-#: Characters whose widths are hard to tell: wide, combining, joined or escaped.
+#: Characters whose width is hard to determine: wide, combining, joined or escaped.
 ODD = st.text(st.sampled_from("ab .日本é\u0301👩\u200d💻❤\ufe0f🇩🇪\n\x1b\\\u202eﷺ"), max_size=80)
 
 
-def word(text: str, view: str) -> tuple[int, int]:
-    start = text.index(view)
-    return start, start + len(view)
+def position(text: str, word: str) -> tuple[int, int]:
+    start = text.index(word)
+    return start, start + len(word)
 
 
 def test_a_sentence_is_cut_around_the_current_word() -> None:
     assert MeasuredText("battery low").view(8, 11, 11) == ("battery ", "low", "")
     assert MeasuredText("").view(0, 0, 80) == ("", "", "")
     sentence = MeasuredText(LONG)
-    assert sentence.view(*word(LONG, "the"), 20) == ("", "the", f" quick brown fox{ELLIPSIS}")
-    assert sentence.view(*word(LONG, "jumps"), 20) == (f"{ELLIPSIS} fox ", "jumps", f" over th{ELLIPSIS}")
-    assert sentence.view(*word(LONG, "dog"), 20) == (f"{ELLIPSIS}s over the lazy ", "dog", "")
+    assert sentence.view(*position(LONG, "the"), 20) == ("", "the", f" quick brown fox{ELLIPSIS}")
+    assert sentence.view(*position(LONG, "jumps"), 20) == (f"{ELLIPSIS} fox ", "jumps", f" over th{ELLIPSIS}")
+    assert sentence.view(*position(LONG, "dog"), 20) == (f"{ELLIPSIS}s over the lazy ", "dog", "")
     heard, lit, ahead = MeasuredText("a" * 50 + " " + "b" * 50).view(51, 101, 12)
-    assert (lit[:3], ahead) == ("bbb", ELLIPSIS), "a word wider than the terminal shows its beginning"
+    assert (lit[:3], ahead) == ("bbb", ELLIPSIS), "the start of a word wider than the terminal is shown"
     assert width(heard + lit + ahead) <= 12
     for end in (0, 3, 7, 11, 99):
         assert MeasuredText("battery low").split(end) == ("battery low"[:end], "battery low"[end:])
 
 
 def test_wide_characters_take_two_columns() -> None:
-    assert [width(each) for each in ("a", "日", "ｱ", "Ａ", "👩", "e\u0301", "…")] == [1, 2, 1, 2, 2, 1, 1]
-    assert width("❤\ufe0f") == width("🇩🇪") / 2 == 2  # drawn by some terminals in fewer, by none in more
+    assert [width(character) for character in ("a", "日", "ｱ", "Ａ", "👩", "e\u0301", "…")] == [1, 2, 1, 2, 2, 1, 1]
+    assert width("❤\ufe0f") == width("🇩🇪") / 2 == 2  # some terminals use fewer columns, none uses more
     heard, lit, ahead = MeasuredText("日本語" * 10).view(12, 15, 11)
     assert width(heard + lit + ahead) <= 11
     assert lit == "日本語"
@@ -241,7 +241,7 @@ def test_wide_characters_take_two_columns() -> None:
 
 def test_escaped_characters_do_not_shift_the_highlight() -> None:
     text = "a\x1b[31m \u202ered\nnext"
-    assert MeasuredText(text).view(*word(text, "next"), 80)[:2] == ("a\\x1b[31m \\u202ered\\n", "next")
+    assert MeasuredText(text).view(*position(text, "next"), 80)[:2] == ("a\\x1b[31m \\u202ered\\n", "next")
 
 
 @given(text=ODD, start=st.integers(-3, 90), length=st.integers(-3, 30), columns=st.integers(-2, 60))
@@ -251,7 +251,7 @@ def test_the_view_fits_the_terminal_and_is_always_printable(text: str, start: in
     heard, lit, ahead = sentence.view(start, start + length, columns)
     shown = heard + lit + ahead
     assert width(shown) <= max(0, columns)
-    assert shown.isprintable() or all(each.isprintable() or each in "\u0301\ufe0f" for each in shown)
+    assert shown.isprintable() or all(character.isprintable() or character in "\u0301\ufe0f" for character in shown)
     if width(sentence.whole) <= columns:
         assert shown == sentence.whole
     elif columns >= 15 and 0 <= start < len(text) and length > 0:

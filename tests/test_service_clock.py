@@ -1,6 +1,6 @@
 """The effects of a suspend on waiting goals.
 
-The tests can't suspend the machine, so they use a clock of their own that jumps ahead.
+The tests can't suspend the machine, so they use a clock that jumps ahead.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ class _BusyEngine:
 
 
 @pytest.fixture
-def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """The seconds of each suspend, by which the server's clock is ahead."""
-    found: list[float] = []
-    monkeypatch.setattr(speech, "elapsed", lambda: time.monotonic() + sum(found))
-    return found
+def suspends(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The length of each suspend in seconds. The server's clock is ahead by their sum."""
+    seconds: list[float] = []
+    monkeypatch.setattr(speech, "elapsed", lambda: time.monotonic() + sum(seconds))
+    return seconds
 
 
-async def _queued_behind_another(ttl: float) -> Speech:
+async def _speech_with_pending_goal(ttl: float) -> Speech:
     served = Speech(Scheduler("4k7f", max_queue=1, settings=replace(INITIAL, ttl=ttl)))
     served.engine = _BusyEngine()  # type: ignore[assignment]
     served.scheduler.engine_ready(served.advance_time())
@@ -52,10 +52,10 @@ async def _queued_behind_another(ttl: float) -> Speech:
 
 
 @in_loop
-async def test_a_goal_that_expired_during_a_suspend_is_recalled_afterwards(slept: list[float]) -> None:
-    served = await _queued_behind_another(ttl=600)
-    await asyncio.sleep(0)  # the loop has set its timer for the ten minutes
-    slept.append(3_600)
+async def test_a_goal_that_expired_during_a_suspend_is_recalled_afterwards(suspends: list[float]) -> None:
+    served = await _speech_with_pending_goal(ttl=600)
+    await asyncio.sleep(0)  # the loop has started its timer for the ten minutes
+    suspends.append(3_600)
     record, end = served.scheduler.find("4k7f-2"), time.monotonic() + speech.CLOCK_CHECK_S + 1
     assert record
     while record.state is not State.RECALLED:
@@ -64,14 +64,14 @@ async def test_a_goal_that_expired_during_a_suspend_is_recalled_afterwards(slept
 
 
 @in_loop
-async def test_requests_after_a_suspend_find_no_expired_goals(slept: list[float]) -> None:
-    served = await _queued_behind_another(ttl=600)
-    slept.append(3_600)
-    served.advance_time()  # every request begins with this
+async def test_requests_after_a_suspend_find_no_expired_goals(suspends: list[float]) -> None:
+    served = await _speech_with_pending_goal(ttl=600)
+    suspends.append(3_600)
+    served.advance_time()  # every request starts with this call
     assert len(served.scheduler.pending) == 0
 
 
-@pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="this system has no clock that counts a suspend")
+@pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="this system has no clock that includes suspends")
 def test_the_servers_clock_includes_suspends() -> None:
     before = time.clock_gettime(time.CLOCK_BOOTTIME)
     assert before <= speech.elapsed() <= time.clock_gettime(time.CLOCK_BOOTTIME)

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
 
-class Counted(socket.socket):
-    """A socket that counts what is sent with it."""
+class CountingSocket(socket.socket):
+    """A socket that counts its `send` calls."""
 
     sent = 0
 
@@ -30,8 +30,8 @@ class Counted(socket.socket):
         return super().send(data, flags)
 
 
-class Told(asyncio.Protocol):
-    """Records the calls of a stream."""
+class Recorder(asyncio.Protocol):
+    """A protocol that records the calls of its stream."""
 
     def __init__(self) -> None:
         self.data = b""
@@ -62,12 +62,12 @@ class Pair:
     """A stream, its recorded calls, and the client's end of the socket."""
 
     def __init__(self) -> None:
-        ours, self.client = socket.socketpair()
-        self.socket = Counted(fileno=ours.detach())
-        for each in (self.socket, self.client):
-            each.setblocking(False)
-        self.told = Told()
-        self.stream = ClientStream(ClientStreams(), self.socket, self.told)
+        server_end, self.client = socket.socketpair()
+        self.socket = CountingSocket(fileno=server_end.detach())
+        for end in (self.socket, self.client):
+            end.setblocking(False)
+        self.recorder = Recorder()
+        self.stream = ClientStream(ClientStreams(), self.socket, self.recorder)
 
     def receive(self) -> bytes:
         """Return the bytes that the client has received."""
@@ -97,10 +97,10 @@ async def turn() -> None:
 
 async def until_lost(pair: Pair) -> None:
     for _ in range(100):
-        if pair.told.lost:
+        if pair.recorder.lost:
             return
         await asyncio.sleep(0.01)
-    pytest.fail("the end was not told")
+    pytest.fail("the end of the stream wasn't reported")
 
 
 @in_loop
@@ -109,7 +109,7 @@ async def test_begin_reads_waiting_input_and_sends_waiting_output_at_once() -> N
         pair.client.send(b"hello\n")
         pair.stream.write(b"greeting\n")
         pair.stream.begin()
-        assert (pair.told.data, pair.receive()) == (b"hello\n", b"greeting\n")
+        assert (pair.recorder.data, pair.receive()) == (b"hello\n", b"greeting\n")
 
 
 @in_loop
@@ -138,7 +138,7 @@ async def test_congestion_is_reported_once_and_all_output_arrives() -> None:
     async with paired() as pair:
         pair.stream.begin()
         written = b""
-        while not pair.told.congested:
+        while not pair.recorder.congested:
             written += b"%08d" % len(written) * 1_000
             pair.stream.write(written[-8_000:])
         assert pair.stream.unsent_bytes > stream.CONGESTION_BYTES
@@ -149,7 +149,7 @@ async def test_congestion_is_reported_once_and_all_output_arrives() -> None:
             received += pair.receive()
             await turn()
         assert received == written
-        assert (pair.told.congested, pair.stream.unsent_bytes) == ([True, False], 0)
+        assert (pair.recorder.congested, pair.stream.unsent_bytes) == ([True, False], 0)
 
 
 @in_loop
@@ -159,11 +159,11 @@ async def test_reading_can_be_paused_and_resumed() -> None:
         pair.stream.pause_reading()
         pair.client.send(b"hello\n")
         await turn()
-        assert pair.told.data == b""
+        assert pair.recorder.data == b""
         for _ in range(2):
             pair.stream.resume_reading()
         await turn()
-        assert pair.told.data == b"hello\n"
+        assert pair.recorder.data == b"hello\n"
 
 
 @in_loop
@@ -175,11 +175,11 @@ async def test_the_end_of_input_is_reported_once_and_replies_are_still_sent() ->
         pair.stream.pause_reading()
         pair.stream.resume_reading()
         await turn()
-        assert (pair.told.ends, pair.told.lost, pair.stream.closing) == (1, [], False)
+        assert (pair.recorder.ends, pair.recorder.lost, pair.stream.closing) == (1, [], False)
         pair.stream.write(b"answer\n")
         pair.stream.close()
         await until_lost(pair)
-        assert (pair.receive(), pair.told.lost) == (b"answer\n", [None])
+        assert (pair.receive(), pair.recorder.lost) == (b"answer\n", [None])
 
 
 def test_close_sends_the_remaining_output_and_abort_does_not() -> None:
@@ -192,13 +192,13 @@ def test_close_sends_the_remaining_output_and_abort_does_not() -> None:
                 pair.stream.abort()
             pair.stream.write(b"not any more")
             received = 0
-            while not pair.told.lost:
+            while not pair.recorder.lost:
                 received += len(pair.receive())
                 await turn()
             pair.stream.close()
             pair.stream.abort()
             await turn()
-            assert pair.told.lost == [None]
+            assert pair.recorder.lost == [None]
             return received + len(pair.receive())
 
     assert asyncio.run(play(abort=False)) == 1_000_000
@@ -214,7 +214,7 @@ async def test_input_can_be_read_after_a_write_to_a_closed_client_failed() -> No
         pair.client.close()
         pair.stream.write(b"answer\n")
         last = []
-        pair.told.connection_lost = lambda error: last.append((error, pair.socket.recv(100)))  # type: ignore[method-assign]
+        pair.recorder.connection_lost = lambda error: last.append((error, pair.socket.recv(100)))  # type: ignore[method-assign]
         await turn()
         ((error, received),) = last
         assert isinstance(error, BrokenPipeError)
@@ -224,14 +224,14 @@ async def test_input_can_be_read_after_a_write_to_a_closed_client_failed() -> No
 
 @in_loop
 async def test_a_bug_in_the_receiver_ends_the_connection() -> None:
-    said = []
-    asyncio.get_running_loop().set_exception_handler(lambda _, context: said.append(context["exception"]))
+    errors = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: errors.append(context["exception"]))
     async with paired() as pair:
-        pair.told.fault = ZeroDivisionError("a bug")
+        pair.recorder.fault = ZeroDivisionError("a bug")
         pair.stream.begin()
         pair.client.send(b"hello\n")
         await until_lost(pair)
-    assert [type(each) for each in said] == [ZeroDivisionError]
+    assert [type(error) for error in errors] == [ZeroDivisionError]
 
 
 @in_loop
@@ -243,7 +243,7 @@ async def test_one_callback_sends_the_output_of_all_streams() -> None:
     async with paired() as first, paired() as second:
         pairs = [first, second]
         for pair in pairs:
-            pair.stream = ClientStream(streams, pair.socket, pair.told)
+            pair.stream = ClientStream(streams, pair.socket, pair.recorder)
         loop.call_soon = lambda *values, **named: calls.append(call(*values, **named))  # type: ignore[assignment, method-assign]
         for _ in range(3):
             for pair in pairs:
@@ -260,19 +260,19 @@ async def test_the_client_with_the_largest_backlog_is_dropped_at_the_limit(monke
     async with contextlib.AsyncExitStack() as stack:
         pairs = [await stack.enter_async_context(paired()) for _ in range(3)]
         for pair in pairs:
-            pair.stream = ClientStream(streams, pair.socket, pair.told)
-            pair.stream.write(b"x" * 1_000_000)  # more than the socket's buffer holds
+            pair.stream = ClientStream(streams, pair.socket, pair.recorder)
+            pair.stream.write(b"x" * 1_000_000)  # exceeds the socket's buffer
         taken = 1_000_000 - pairs[0].stream.unsent_bytes
         monkeypatch.setattr(stream, "MAX_TOTAL_OUTPUT_BYTES", streams.unread_bytes + 3_000)
         pairs[0].stream.write(b"x" * 1_000)
-        pairs[1].stream.count_held(1_500)  # as if the client didn't read a list
+        pairs[1].stream.count_held(1_500)  # like a list that the client doesn't read
         pairs[1].stream.count_held(500)
-        assert not any(each.stream.closing for each in pairs)
+        assert not any(pair.stream.closing for pair in pairs)
         pairs[2].stream.write(b"x" * 1_000)
         await until_lost(pairs[1])
-        assert [each.stream.closing for each in pairs] == [False, True, False]
+        assert [pair.stream.closing for pair in pairs] == [False, True, False]
         assert streams.unread_bytes == 2 * (1_000_000 - taken) + 2_000
-        pairs[1].stream.count_held(-2_000)  # must have no effect after the end of the stream
+        pairs[1].stream.count_held(-2_000)  # must have no effect after the stream has ended
         assert len(pairs[0].receive()) == taken
         await turn()
         assert streams.unread_bytes == pairs[0].stream.unsent_bytes + pairs[2].stream.unsent_bytes

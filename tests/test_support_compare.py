@@ -1,4 +1,4 @@
-"""The comparison of recorded sound accepts the right sentence, and nothing else."""
+"""The comparison of recorded sound accepts only the right sentence."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.support.compare import (
 from tests.support.recording import LOUD
 from tests.support.reference import RATE, Sentence, render
 from tests.support.surroundings import clean_environment, needs
-from tests.tools.soak_clients import ALIKE
+from tests.tools.soak_clients import MIN_SIMILARITY
 
 if TYPE_CHECKING:
     import pathlib
@@ -74,7 +74,7 @@ def test_the_reference_equals_the_output_of_espeak_ng_bit_for_bit(low: Samples, 
 def test_a_played_sentence_is_recorded_sample_for_sample(sink: Sink) -> None:
     (short,) = render(["battery low"])
     with sink.record() as recording:
-        # With a buffer that does not run dry if the machine is busy, which loses samples.
+        # A large buffer doesn't run dry on a busy machine, which would lose samples.
         command = ["pacat", "--raw", "--format=s16le", f"--rate={RATE}", "--channels=1", "--latency-msec=500"]
         environment = clean_environment(sink.directory, sink.env)
         subprocess.run(command, env=environment, input=short.tobytes(), check=True, timeout=60)
@@ -83,35 +83,35 @@ def test_a_played_sentence_is_recorded_sample_for_sample(sink: Sink) -> None:
 
 
 def test_a_sentence_is_recognised_despite_gaps_and_lost_samples(low: Samples) -> None:
-    """A player that runs dry puts silence between two samples, and the monitor loses some samples then."""
+    """If a player runs dry, it inserts silence, and the monitor loses some samples."""
     (result,) = assert_heard(recorded(low), [low])
     assert result.correlation > 0.999
     assert result.heard == result.expected
     heard = [low, (low // 2).astype(np.int16), np.delete(low, slice(9000, 9041)), np.delete(low, slice(9000, 9072))]
     for at, lost in ((9000, 0), (9000, 41), (27000, 0), (27000, 41)):
-        begun = np.concatenate([low[:at], zeros(1500), low[at + lost : at + 6000], zeros(700)])
-        heard.append(np.concatenate([begun, low[at + 6000 :]]))
+        first_part = np.concatenate([low[:at], zeros(1500), low[at + lost : at + 6000], zeros(700)])
+        heard.append(np.concatenate([first_part, low[at + 6000 :]]))
         for wrong in (low[at + 9000 :], low[at + 5000 :]):
             with pytest.raises(AssertionError):
-                assert_heard(recorded(begun, wrong), [low])
-    for each in heard:
-        assert compare(recorded(each), low).same
-        assert_heard(recorded(each), [low])
+                assert_heard(recorded(first_part, wrong), [low])
+    for samples in heard:
+        assert compare(recorded(samples), low).same
+        assert_heard(recorded(samples), [low])
     assert_heard(recorded(heard[-1], SILENCE, low), [low, low])
 
 
 def test_a_wrong_sentence_is_detected(low: Samples) -> None:
     left, right, low_it = render([LEFT])[0], render([RIGHT])[0], render([LOW_IT])[0]
-    ends = [without_end(low, each) for each in (0.03, 0.1, 0.3)]
+    cut = [without_end(low, seconds) for seconds in (0.03, 0.1, 0.3)]
     stutter = np.concatenate([low[:12000], low[11000:]])
     gap = np.concatenate([low[:9000], zeros(3000), low[12000:]])
     lost = np.delete(low, slice(9000, 9240))
     twice = np.delete(low, [*range(9000, 9072), *range(15000, 15072)])
-    wrong = [(each, low) for each in (*ends, gap, stutter, lost, twice, low_it)]
+    wrong = [(samples, low) for samples in (*cut, gap, stutter, lost, twice, low_it)]
     for heard, expected in [*wrong, (right, left)]:
         with pytest.raises(AssertionError, match="not heard correctly"):
             assert_heard(recorded(heard), [expected])
-    for heard, expected in ((ends[0], low), (low_it, low), (right, left)):
+    for heard, expected in ((cut[0], low), (low_it, low), (right, left)):
         assert not compare(recorded(heard), expected).same
     dropped = np.concatenate([low[at : at + 2008] for at in range(0, len(low), 2048)])
     worn = np.concatenate([part for at in range(0, len(low), 2048) for part in (low[at : at + 1798], zeros(40))])
@@ -137,7 +137,7 @@ def test_sentences_must_be_heard_once_and_in_order(low: Samples) -> None:
     first, second, third = references = render([LOW, LEFT, LOW_IT])
     assert_heard(recorded(*references), references)
     _, end = extent(first) or (0, 0)
-    assert_heard(recorded(first[: end + 100], second, SILENCE, third), references)  # the pause at its end may be cut
+    assert_heard(recorded(first[: end + 100], second, SILENCE, third), references)  # the pause at the end may be cut
     click = np.full(40, 5000, np.int16)
     for wrong in [
         *((second, first, third), (first, third), (first, second), (first, second, third, third)),
@@ -163,49 +163,49 @@ def test_a_sentence_is_found_directly_after_a_stopped_one(silence: int) -> None:
 def test_a_stopped_or_paused_sentence_is_recognised_despite_a_gap(low: Samples, dry: int | None) -> None:
     (left,) = render([LEFT])
     gap, dry = zeros(900 if dry else 0), dry or 0
-    begun = np.concatenate([low[:dry], gap, low[dry:20000]])
-    assert assert_only_beginning(recorded(begun), low) == pytest.approx(20000 / RATE, abs=0.1)
-    for wrong in ([low[:dry], gap, left[dry:20000]], [begun, low[-20000:]]):
+    first_part = np.concatenate([low[:dry], gap, low[dry:20000]])
+    assert assert_only_beginning(recorded(first_part), low) == pytest.approx(20000 / RATE, abs=0.1)
+    for wrong in ([low[:dry], gap, left[dry:20000]], [first_part, low[-20000:]]):
         with pytest.raises(AssertionError):
             assert_only_beginning(recorded(*wrong), low)
     with pytest.raises(AssertionError, match="nothing was heard"):
         assert_only_beginning(SILENCE, low)
     at = 16000 - len(gap)
-    held = assert_resumed(recorded(begun[:16000], PAUSE, low[at:]), low, 1.9)
-    assert held == pytest.approx(2, abs=0.3)
-    assert_resumed(recorded(begun[:16000], PAUSE, low[at - 800 :]), low, 1.9, repeated=0.05)
+    paused_s = assert_resumed(recorded(first_part[:16000], PAUSE, low[at:]), low, 1.9)
+    assert paused_s == pytest.approx(2, abs=0.3)
+    assert_resumed(recorded(first_part[:16000], PAUSE, low[at - 800 :]), low, 1.9, repeated=0.05)
     for pause, rest in (
         *((PAUSE, low[at + 900 :]), (PAUSE, low[at - 1100 :]), (PAUSE, low[:0]), (PAUSE[:RATE], low[at:])),
         *((low[:0], low[at:]), (PAUSE, without_end(low, 0.1)[at:])),
     ):
         with pytest.raises(AssertionError):
-            assert_resumed(recorded(begun[:16000], pause, rest), low, 1.9)
+            assert_resumed(recorded(first_part[:16000], pause, rest), low, 1.9)
 
 
 def test_quiet_samples_next_to_a_pause_belong_to_the_sentence() -> None:
-    """A sentence is held at its own zeros, which stand between faint sounds, and it ran dry before."""
+    """The sentence is paused at a silent moment between faint sounds, after the player ran dry."""
     (sentence,) = render([Sentence("two three four five six seven eight nine ten", rate=450)])
     sounds = np.flatnonzero(sentence)
-    places = [int(sounds[each]) for each in np.flatnonzero(np.diff(sounds) > 200)]
+    places = [int(sounds[index]) for index in np.flatnonzero(np.diff(sounds) > 200)]
     quiet = [place for place in places if np.abs(sentence[place - 8 : place + 1]).max() < LOUD and place > 9000]
     assert quiet
-    for at in (each for place in quiet for each in (place + 1, place + 100)):
-        begun = np.concatenate([sentence[:5000], zeros(900), sentence[5000:at]])
-        assert_resumed(recorded(begun, PAUSE, sentence[at:]), sentence, 1.9)
-        assert_resumed(recorded(begun, PAUSE, sentence[at - 800 :]), sentence, 1.9, repeated=0.05)
+    for at in (sample for place in quiet for sample in (place + 1, place + 100)):
+        first_part = np.concatenate([sentence[:5000], zeros(900), sentence[5000:at]])
+        assert_resumed(recorded(first_part, PAUSE, sentence[at:]), sentence, 1.9)
+        assert_resumed(recorded(first_part, PAUSE, sentence[at - 800 :]), sentence, 1.9, repeated=0.05)
         for wrong in (sentence[at + 1500 :], sentence[at - 1500 :]):
             with pytest.raises(AssertionError):
-                assert_resumed(recorded(begun, PAUSE, wrong), sentence, 1.9, repeated=0.05)
+                assert_resumed(recorded(first_part, PAUSE, wrong), sentence, 1.9, repeated=0.05)
 
 
 def test_similarity_distinguishes_sentences_whose_samples_vary() -> None:
-    """It is spoken a fifth time by one process, with a gap at which the player ran dry."""
-    low, left, right = (Sentence(each, rate=450) for each in (LOW, LEFT, RIGHT))
+    """One process speaks the sentence a fifth time, with a gap because the player ran dry."""
+    low, left, right = (Sentence(text, rate=450) for text in (LOW, LEFT, RIGHT))
     first, *_, again = render([low, left, right, left, low])
     gap = zeros(RATE // 40)
     for at in (4_000, 13_000):
-        assert similarity(recorded(again[:at], gap, again[at:]), first) > ALIKE
+        assert similarity(recorded(again[:at], gap, again[at:]), first) > MIN_SIMILARITY
         assert similarity(recorded(first[:at], gap, first[at:]), first) > 0.8
         for other in render([left, right]):
-            assert similarity(recorded(other[:at], gap, other[at:]), first) < ALIKE
+            assert similarity(recorded(other[:at], gap, other[at:]), first) < MIN_SIMILARITY
     assert similarity(SILENCE, first) == 0.0

@@ -1,4 +1,4 @@
-"""A time limit fails a late result, unless the control beside it was late by as much."""
+"""A late result fails a time limit, unless the control was equally late."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 @pytest.fixture
 def control() -> Iterator[MakeControl]:
-    """Makes controls that take 10 ms before the limited block, and so many seconds in it."""
+    """Return a function that makes controls. They take 10 ms before the limited block, and `control_s` in it."""
 
-    def make(beside: float) -> Callable[[], float]:
+    def make(control_s: float) -> Callable[[], float]:
         times = iter([0.01] * 5)
-        return lambda: next(times, beside)
+        return lambda: next(times, control_s)
 
     yield make
-    take_unmeasured()  # so that the summary doesn't list these
+    take_unmeasured()  # keep these out of the summary
 
 
 def test_a_result_in_time_is_measured(control: MakeControl) -> None:
@@ -33,23 +33,23 @@ def test_a_result_in_time_is_measured(control: MakeControl) -> None:
 
 
 def test_a_late_result_beside_a_late_control_is_not_measured(control: MakeControl) -> None:
-    went_on = False
+    continued = False
     with limits(control(0.03)):
         assert_within(0.25, 0.1, "it")
-        went_on = True
-    assert went_on
-    (told,) = take_unmeasured()
-    assert told.startswith("it took 0.250 s, the limit is 0.1 s; the control took 0.030 s, usually 0.010 s")
+        continued = True
+    assert continued
+    (note,) = take_unmeasured()
+    assert note.startswith("it took 0.250 s, the limit is 0.1 s; the control took 0.030 s, usually 0.010 s")
     with limits(control(0.03)):
         assert_within(0.089, 0.02, "it")
     assert len(take_unmeasured()) == 1
 
 
 @pytest.mark.parametrize(
-    ("beside", "seconds", "limit"), [(0.01, 0.11, 0.1), (0.019, 0.11, 0.1), (0.03, 0.35, 0.1), (0.03, 0.091, 0.02)]
+    ("control_s", "seconds", "limit"), [(0.01, 0.11, 0.1), (0.019, 0.11, 0.1), (0.03, 0.35, 0.1), (0.03, 0.091, 0.02)]
 )
-def test_an_unexplained_late_result_fails(control: MakeControl, beside: float, seconds: float, limit: float) -> None:
-    with pytest.raises(AssertionError, match="it took"), limits(control(beside)):
+def test_an_unexplained_late_result_fails(control: MakeControl, control_s: float, seconds: float, limit: float) -> None:
+    with pytest.raises(AssertionError, match="it took"), limits(control(control_s)):
         assert_within(seconds, limit, "it")
     assert take_unmeasured() == []
 

@@ -1,6 +1,6 @@
-"""Speech is understood by an independent recognizer, which hears the sound that a loudspeaker gets.
+"""An independent recognizer understands the speech.
 
-It chooses among twenty sentences of a robot, so by chance one of them would be right.
+It hears the same sound as a loudspeaker, and chooses among twenty sentences. By chance, it would get one of them right.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ going to the kitchen
 hello how can i help you
 speech volume is now at fifty percent
 """.strip().splitlines()
-#: By its id: "en" is the language, and means the neural voice if the server speaks with one.
+#: An id, because the language "en" would select the neural voice if the server uses one.
 ESPEAK = "gmw/en"
 
 
@@ -71,7 +71,7 @@ def test_ten_sentences_of_a_neural_voice_are_understood(make_talk: MakeTalk, tmp
     assert understood == SENTENCES[::2]
 
 
-@pytest.mark.slow  # each sentence takes as long as it is, with either voice: a minute and a half
+@pytest.mark.slow  # both voices speak all sentences in real time: a minute and a half
 def test_a_neural_voice_is_understood_as_well_as_espeak(make_talk: MakeTalk, sink: Sink, tmp_path: Path) -> None:
     real_voice()
     needs_packages(PACKAGE)
@@ -79,12 +79,12 @@ def test_a_neural_voice_is_understood_as_well_as_espeak(make_talk: MakeTalk, sin
     talk = serve_with_voice(make_talk, REAL_VOICE, sink=sink, env=env)
     wrong: dict[str, list[tuple[str, str]]] = {ESPEAK: [], REAL_VOICE: []}
     for sentence in SENTENCES:
-        for voice, told in wrong.items():
+        for voice, mistakes in wrong.items():
             with sink.record() as recording:
                 say(talk, sentence, voice)
-            found = recognize(recording.samples, SENTENCES)
-            if found != sentence:
-                told.append((sentence, found))
+            recognised = recognize(recording.samples, SENTENCES)
+            if recognised != sentence:
+                mistakes.append((sentence, recognised))
     assert len(wrong[REAL_VOICE]) <= min(1, len(wrong[ESPEAK])), wrong
 
 

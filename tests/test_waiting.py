@@ -1,4 +1,4 @@
-"""The server between engine and clients: waiting requests, batches of notifications, and the order of reports.
+"""The server between engine and clients: waiting requests, batches of notifications, and the order of events.
 
 The tests count steps and bytes, not time. `conformance/test_goals_order.py` tests the order of waiting goals.
 """
@@ -41,14 +41,14 @@ class Client:
     client = Sender(1, 1, "client")
 
     def __init__(self) -> None:
-        self.told: list[JsonObject] = []
+        self.replies: list[JsonObject] = []
         self.unanswered: dict[PendingRequest, None] = {}
 
     def send(self, message: JsonObject) -> None:
-        self.told.append(message)
+        self.replies.append(message)
 
     def send_list(self, messages: Iterable[JsonObject]) -> None:
-        self.told += messages
+        self.replies += messages
 
     def publish(self, event: bytes, *, feedback: bool = False) -> None:
         """Ignore events: these tests count replies."""
@@ -58,7 +58,7 @@ class Client:
 
     def goals(self) -> list[str]:
         """Return the texts of the goals in the recorded replies."""
-        return [str(cast("Any", each)["goal"]["text"]) for each in self.told]
+        return [str(cast("Any", reply)["goal"]["text"]) for reply in self.replies]
 
 
 class Engine:
@@ -82,11 +82,11 @@ class Server:
         self.speech.engine = cast("Any", Engine())
         self.speech.scheduler.engine_ready(self.speech.advance_time())
         self.requests = Requests(self.speech, dict)
-        self.asked = 0
+        self.room_checks = 0
         has_room = self.speech.scheduler.has_room
 
         def counted(say: Say) -> bool:
-            self.asked += 1
+            self.room_checks += 1
             return has_room(say)
 
         self.speech.scheduler.has_room = counted  # type: ignore[method-assign]
@@ -114,9 +114,9 @@ async def turn() -> None:
     await asyncio.sleep(0)
 
 
-async def all_told(line: Notifications) -> None:
+async def all_notified(notifications: Notifications) -> None:
     for _ in range(1_000_000):
-        if line.done:
+        if notifications.done:
             return
         await asyncio.sleep(0)
 
@@ -127,14 +127,14 @@ async def test_a_room_check_asks_once_per_priority() -> None:
     server.fill()
     for number in range(1_000):
         server.wait(client, f"{number}", priority=-(number % 2))
-    server.asked = 0
+    server.room_checks = 0
     server.requests._schedule_room_check()
     await turn()
-    assert (server.asked, client.told) == (2, [])
+    assert (server.room_checks, client.replies) == (2, [])
     server.make_room()
     await turn()
     assert client.goals() == ["0"]
-    assert server.asked < 10
+    assert server.room_checks < 10
 
 
 @in_loop
@@ -142,25 +142,25 @@ async def test_the_memory_for_all_waiting_requests_is_limited() -> None:
     server, one, other = Server(), Client(), Client()
     server.fill()
     count = 0
-    while not other.told:
+    while not other.replies:
         server.wait(one if count < 900 else other, "w" * 9_000, data={"a": ["w" * 30_000]})
         count += 1
     assert 0.9 * MAX_KEPT_REQUEST_BYTES < (count - 1) * (39_000 + REQUEST_BYTES) < MAX_KEPT_REQUEST_BYTES
-    (refused,) = cast("Any", other.told)
+    (refused,) = cast("Any", other.replies)
     assert refused["goal"]["reason"] == "queue_full"
     assert "too many requests are waiting (64 MiB)" in refused["goal"]["message"]
     server.requests.left(cast("Any", other))
     assert not server.requests.is_waiting(cast("Any", other))
     third = Client()
     server.wait(third, "there is room again")
-    assert third.told == []
+    assert third.replies == []
     server.requests.left(cast("Any", one))
     server.requests.left(cast("Any", third))
     assert server.requests._waiting_bytes == 0
 
 
 @pytest.mark.parametrize(
-    "request_", [Say("w", data={"a": [[] for _ in range(300)]}), Wait(ids=tuple(f"{each}" for each in range(400)))]
+    "request_", [Say("w", data={"a": [[] for _ in range(300)]}), Wait(ids=tuple(f"{number}" for number in range(400)))]
 )
 @in_loop
 async def test_small_values_are_counted_with_their_real_memory_use(request_: Say | Wait) -> None:
@@ -178,9 +178,9 @@ async def test_a_client_that_leaves_during_a_cancel_is_forgotten() -> None:
         server.wait(other, f"other {number}")
     server.ask(canceling, Cancel())
     server.requests.left(cast("Any", one))
-    await all_told(server.speech.notifications)
-    assert len(other.told) == 100
-    assert len(one.told) < 100
+    await all_notified(server.speech.notifications)
+    assert len(other.replies) == 100
+    assert len(one.replies) < 100
     assert server.requests._waiting_bytes == 0
     assert not server.requests.is_waiting(cast("Any", other))
 
@@ -194,8 +194,8 @@ async def test_a_server_ends_only_after_answering_every_waiting_goal() -> None:
         server.wait(one, f"{number}")
     server.requests.shut_down()
     assert not server.speech.finished.is_set()
-    await all_told(server.speech.notifications)
-    assert len(one.told) == count
+    await all_notified(server.speech.notifications)
+    assert len(one.replies) == count
     assert server.speech.finished.is_set()
 
 
@@ -207,10 +207,10 @@ async def test_a_request_during_shutdown_is_answered_before_the_server_ends() ->
     server.fill(count)
     server.requests.shut_down()
     server.ask(late, Wait())
-    assert late.told == []
+    assert late.replies == []
     assert not server.speech.finished.is_set()
-    await all_told(server.speech.notifications)
-    assert late.told == [{"ok": True, "count": 0}]
+    await all_notified(server.speech.notifications)
+    assert late.replies == [{"ok": True, "count": 0}]
     assert server.speech.finished.is_set()
 
 
@@ -230,7 +230,7 @@ async def test_a_bug_in_a_waiting_request_does_not_affect_others(monkeypatch: py
     monkeypatch.setattr(server.speech.scheduler, "submit", fails_once)
     server.make_room()
     await turn()
-    first, second = cast("Any", client.told)
+    first, second = cast("Any", client.replies)
     assert first["error"]["code"] == "internal_error"
     assert second["goal"]["text"] == "two"
     assert not server.requests.is_waiting(cast("Any", client))
@@ -238,15 +238,15 @@ async def test_a_bug_in_a_waiting_request_does_not_affect_others(monkeypatch: py
 
 
 class Readers:
-    """Imitates the streams of all clients. It records the received numbers and counts unread bytes."""
+    """A replacement for the streams of all clients. It records the received numbers and counts unread bytes."""
 
     def __init__(self) -> None:
         self.loop = asyncio.get_running_loop()
         self.unread_bytes = 0
-        self.told: list[int] = []
+        self.received: list[int] = []
 
-    def tell(self, number: int) -> None:
-        self.told.append(number)
+    def notify(self, number: int) -> None:
+        self.received.append(number)
         self.unread_bytes += 300_000
 
 
@@ -269,7 +269,7 @@ async def test_cancelling_thousands_of_goals_does_not_block_other_clients() -> N
         await asyncio.sleep(0)
         most = max(most, len(ended) - before)
     assert most <= 2 * subscribers._MAX_PER_TURN
-    assert len(asking.told) > count / subscribers._MAX_PER_TURN / 2
+    assert len(asking.replies) > count / subscribers._MAX_PER_TURN / 2
 
 
 @in_loop
@@ -278,27 +278,27 @@ async def test_a_new_watcher_gets_only_events_after_its_snapshot(monkeypatch: py
     server, watcher = Server(count), Client()
     server.fill(1 + count)
     server.ask(Client(), Cancel(before=f"4k7f-{count + 1}"))
-    told: list[str] = []
+    numbers: list[str] = []
     subscribed = server.speech.subscribers
-    monkeypatch.setattr(subscribed, "watch", lambda _: told.append(str(subscribed._numbers)))
+    monkeypatch.setattr(subscribed, "watch", lambda _: numbers.append(str(subscribed._numbers)))
     server.ask(watcher, Watch())
-    assert (told, server.speech.notifications.done) == ([], False)
-    await all_told(server.speech.notifications)
-    assert told == [str(subscribed._numbers)]
+    assert (numbers, server.speech.notifications.done) == ([], False)
+    await all_notified(server.speech.notifications)
+    assert numbers == [str(subscribed._numbers)]
 
 
 @in_loop
 async def test_notifications_are_sent_as_fast_as_clients_read() -> None:
     readers = Readers()
-    line = Notifications(cast("Any", readers))
-    line.add([partial(readers.tell, number) for number in range(100)])
+    notifications = Notifications(cast("Any", readers))
+    notifications.add([partial(readers.notify, number) for number in range(100)])
     most = 0
-    while not line.done:
+    while not notifications.done:
         most = max(most, readers.unread_bytes)
         readers.unread_bytes = 0  # all clients have read
         await asyncio.sleep(0.001)
     assert most < 2_000_000
-    assert readers.told == list(range(100))
+    assert readers.received == list(range(100))
 
 
 @in_loop
@@ -308,31 +308,31 @@ async def test_the_wait_for_clients_that_do_not_read_is_limited(monkeypatch: pyt
     loop, readers, waits = asyncio.get_running_loop(), Readers(), []
     later = loop.call_later
     loop.call_later = lambda *values: waits.append(values) or later(*values)  # type: ignore[method-assign, func-returns-value]
-    line = Notifications(cast("Any", readers))
-    line.add([partial(readers.tell, number) for number in range(400)])
-    assert len(readers.told) < 20
-    await all_told(line)
-    assert readers.told == list(range(400))
-    # There is a wait after each of a hundred batches except the last, and one every two milliseconds for the first few.
+    notifications = Notifications(cast("Any", readers))
+    notifications.add([partial(readers.notify, number) for number in range(400)])
+    assert len(readers.received) < 20
+    await all_notified(notifications)
+    assert readers.received == list(range(400))
+    # There is a wait after each of a hundred batches but the last, and every 2 ms for the first few.
     assert 99 <= len(waits) < 120
 
 
 @in_loop
 async def test_nested_notifications_are_sent_in_order_despite_a_bug() -> None:
-    told: list[str] = []
-    line = Notifications(cast("Any", Readers()))
+    sent: list[str] = []
+    notifications = Notifications(cast("Any", Readers()))
 
     def first() -> None:
-        told.append("first")
-        line.add([lambda: told.append("of the first")])
+        sent.append("first")
+        notifications.add([lambda: sent.append("of the first")])
         raise ZeroDivisionError("a bug")
 
-    line.add([first, lambda: told.append("second")])
-    assert told == ["first", "of the first", "second"]
+    notifications.add([first, lambda: sent.append("second")])
+    assert sent == ["first", "of the first", "second"]
 
 
-class _Written:
-    """An engine that appends its requests to the list to which the test appends the clients' events."""
+class _RecordingEngine:
+    """An engine that appends its requests to the same list as the test does with the clients' events."""
 
     def __init__(self, written: list[str]) -> None:
         self.written = written
@@ -359,13 +359,13 @@ async def test_many_words_at_once_do_not_block_clients() -> None:
     words = [protocol.Word("4k7f-1", 0, 1, number, 0.0) for number in range(count)]
 
     def post_all() -> None:
-        for each in words:
-            served.report(each)
+        for word in words:
+            served.report(word)
 
     thread = threading.Thread(target=post_all)
     thread.start()
     thread.join()
-    assert len(wakes) == 1  # one for all of them
+    assert len(wakes) == 1  # one for all words
     turns = 0
     while len(taken) < count:
         await asyncio.sleep(0)
@@ -385,7 +385,7 @@ async def test_a_bug_in_a_report_does_not_affect_other_reports(monkeypatch: pyte
         if len(taken) == 1:
             raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr(log, "write_bug", lambda what, error: failed.append((what, type(error))))
+    monkeypatch.setattr(log, "write_bug", lambda context, error: failed.append((context, type(error))))
     served = Speech(Scheduler("4k7f", max_queue=1))
     served._process_report = take  # type: ignore[method-assign, assignment]
     for number in range(3):
@@ -399,7 +399,7 @@ async def test_a_bug_in_a_report_does_not_affect_other_reports(monkeypatch: pyte
 async def test_the_engine_gets_its_next_task_before_clients_get_events() -> None:
     written: list[str] = []
     served = Speech(Scheduler("4k7f", max_queue=1))
-    served.engine = _Written(written)  # type: ignore[assignment]
+    served.engine = _RecordingEngine(written)  # type: ignore[assignment]
     served.scheduler.engine_ready(served.advance_time())
 
     def changed(record: Record, state: State, _: float) -> None:

@@ -22,22 +22,22 @@ LONG = "moving to the charger on the second floor, please step back from the doo
 class Lines:
     """A `talk watch` whose standard output is a pipe."""
 
-    def __init__(self, talk: Talk, *words: str) -> None:
-        self.process = talk.start("watch", *words)
+    def __init__(self, talk: Talk, *arguments: str) -> None:
+        self.process = talk.start("watch", *arguments)
         self.lines: list[str] = []
-        self.next("")  # the first line says that it watches
+        self.next("")  # the first line confirms that it watches
 
-    def next(self, words: str) -> str:
-        """Read up to the line that contains these words, and return it."""
+    def next(self, text: str) -> str:
+        """Read up to the line that contains this text, and return it."""
         assert self.process.stdout
         for line in self.process.stdout:
             self.lines.append(line.rstrip("\n"))
-            if words in line:
+            if text in line:
                 return self.lines[-1]
-        raise AssertionError(f"no line with {words!r} in {self.lines}")
+        raise AssertionError(f"no line with {text!r} in {self.lines}")
 
     def end(self) -> int:
-        """Press Ctrl-C, and return the exit code. Nothing more may be printed."""
+        """Send SIGINT, and return the exit code. Nothing more may be printed."""
         self.process.send_signal(signal.SIGINT)
         code = self.process.wait(10)
         assert self.process.stdout
@@ -47,12 +47,12 @@ class Lines:
 
 
 def number(goal_id: str) -> str:
-    """Return the number by which a goal of the server is shown."""
+    """Return the short form of a goal's id."""
     return goal_id.partition("-")[2]
 
 
-def at_terminal(talk: Talk, columns: int, *words: str, **env: str) -> Terminal:
-    return Terminal([*TALK, *words], {"TERM": "xterm", **talk.env, **env}, columns)
+def at_terminal(talk: Talk, columns: int, *arguments: str, **env: str) -> Terminal:
+    return Terminal([*TALK, *arguments], {"TERM": "xterm", **talk.env, **env}, columns)
 
 
 def test_in_a_pipe_every_event_is_printed_at_once_as_a_full_line(scripted: Talk) -> None:
@@ -67,7 +67,7 @@ def test_in_a_pipe_every_event_is_printed_at_once_as_a_full_line(scripted: Talk)
     watch.next("PREEMPTING")
     assert re.search(rf'PREEMPTED   {goal_id} +"{LONG}"  canceled by .*, pid \d+$', watch.next("PREEMPTED"))
     assert watch.end() == 130
-    assert not any("\x1b" in each or "never-ends  " in each or " word " in each for each in watch.lines)
+    assert not any("\x1b" in line or "never-ends  " in line or " word " in line for line in watch.lines)
 
 
 def test_watch_starts_with_the_current_goals(scripted: Talk) -> None:
@@ -90,9 +90,9 @@ def test_words_are_shown_with_feedback(scripted: Talk) -> None:
     watch = Lines(scripted, "-f")
     goal_id = scripted.run("say", "battery low\x1b[m").id
     watch.next("SUCCEEDED")
-    words = [each for each in watch.lines if "  word  " in each]
+    words = [line for line in watch.lines if "  word  " in line]
     heads = rf"\S+  word        {number(goal_id)} +"
-    assert [re.sub(heads, "", each) for each in words] == ["battery  0.00 s", r"low\x1b[m  0.05 s"]
+    assert [re.sub(heads, "", line) for line in words] == ["battery  0.00 s", r"low\x1b[m  0.05 s"]
     assert watch.end() == 130
 
 
@@ -105,7 +105,7 @@ def test_json_prints_the_protocols_events(scripted: Talk) -> None:
     watch.next("SUCCEEDED")
     assert watch.end() == 130
     scripted.watcher.wait_for_terminal(goal_id)
-    assert [json.loads(each) for each in watch.lines[1:]] == scripted.watcher.events()
+    assert [json.loads(line) for line in watch.lines[1:]] == scripted.watcher.events()
 
 
 def test_the_clients_that_paused_and_resumed_are_shown(scripted: Talk) -> None:
@@ -181,7 +181,7 @@ def test_an_idle_watcher_uses_no_processor_time(scripted: Talk) -> None:
     before = _switches(watch.process.pid)
     scripted.run("voices")  # time passes, and no goal is sent
     scripted.run("status")
-    assert _switches(watch.process.pid) - before <= 1  # the server may show once that it is alive
+    assert _switches(watch.process.pid) - before <= 1  # the server may report once that it is alive
     assert watch.end() == 130
 
 

@@ -1,10 +1,10 @@
-"""Makes the README's picture: a real session in a real terminal, beside a real server that plays to nobody.
+"""Creates the README's animated picture by recording a terminal session.
 
-    python .github/picture/picture.py [FILE]      FILE: talk.svg beside this script
+    python .github/picture/picture.py [FILE]      the default is talk.svg beside this script
 
-A shell runs in a pseudo-terminal and is typed at; each change of its screen is kept with its time. The picture plays
-them: every row as long as it stood there. Where nothing may move it shows the screen as it was at the end. It needs
-what `talk` needs, and no more.
+The script runs a shell in a pseudo-terminal, types commands, and records each change of the screen with its time. The
+picture replays these changes. If the viewer has switched off animations, it shows the final screen. The script has no
+other requirements than `talk`.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ COMMANDS = (
     'talk say --wait -- "back in the dock" && echo "it was heard to its end"',
 )
 COLUMNS, ROWS = 96, 20
-#: Seconds: between two keys, after a command, and at the end before it begins again.
-KEY, READ, REST = 0.025, 1.1, 5.0
-#: Longest time for one command.
-LIMIT = 30.0
+#: Pauses between two keys, after a command, and before the picture starts again.
+KEY_S, READ_S, REST_S = 0.025, 1.1, 5.0
+#: Time limit for one command.
+COMMAND_LIMIT_S = 30.0
 PROMPT = "$ "
-#: Of the picture: a character's width and a row's height, and what is around them.
+#: Width of a character, height of a row, and width of the margin, in pixels.
 WIDTH, HEIGHT, EDGE = 8.4, 19, 14
 STYLE = """
 text { font: 14px ui-monospace, "DejaVu Sans Mono", Menlo, Consolas, monospace; fill: #d8dee9; white-space: pre }
@@ -61,14 +61,14 @@ Row = tuple[Cell, ...]
 
 
 class Frame(NamedTuple):
-    """The screen from one moment on."""
+    """The content of the screen, and the time in seconds at which it appeared."""
 
     at: float
     rows: tuple[Row, ...]
 
 
 class Screen:
-    """As much of a terminal as `talk` and a shell use."""
+    """A terminal that supports the control sequences of `talk` and a shell."""
 
     def __init__(self) -> None:
         self.rows: list[list[Cell]] = [[]]
@@ -76,6 +76,7 @@ class Screen:
         self._attributes = ""
 
     def draw(self, text: str) -> None:
+        """Draw the program's output."""
         for part in re.finditer(r"\x1b\[\??([0-9;]*)([A-Za-z])|(.)", text, re.DOTALL):
             if part[3] is None:
                 self._control(part[1], part[2])
@@ -92,9 +93,11 @@ class Screen:
                     raise SystemExit(f"a line is too long for the picture: {row}")
 
     def last(self) -> str:
-        return "".join(each for each, _ in self.rows[-1])
+        """Return the text of the last row."""
+        return "".join(character for character, _ in self.rows[-1])
 
     def frame(self, at: float) -> Frame:
+        """Return the current screen as a frame."""
         return Frame(at, tuple(map(tuple, self.rows)))
 
     def _control(self, numbers: str, letter: str) -> None:
@@ -103,11 +106,14 @@ class Screen:
         elif letter == "K":
             del self.rows[-1][0 if numbers == "2" else self._column :]
         elif letter != "h" and letter != "l":
-            raise SystemExit(f"a control sequence that the picture doesn't know: ESC[{numbers}{letter}")
+            raise SystemExit(f"the control sequence ESC[{numbers}{letter} is not supported")
 
 
 def record(speed: float) -> list[Frame]:
-    """Return what a terminal showed while the commands were typed and run; `speed` 0: no time for a reader."""
+    """Run commands in a terminal, and record the screen.
+
+    At speed 0, there are no pauses.
+    """
     with contextlib.ExitStack() as stack:
         place = stack.enter_context(tempfile.TemporaryDirectory(prefix="robot-"))
         env = _environment(place)
@@ -121,6 +127,7 @@ def record(speed: float) -> list[Frame]:
 
 
 def _environment(place: str) -> dict[str, str]:
+    """Create a `talk` command in `place`, and return an environment for it."""
     talk = Path(place, "talk")
     talk.write_text(f'#!/bin/sh\nexec {sys.executable} -m talkcli "$@"\n', encoding="utf-8")
     talk.chmod(0o755)
@@ -136,6 +143,7 @@ def _environment(place: str) -> dict[str, str]:
 
 
 def _serve(stack: contextlib.ExitStack, env: dict[str, str]) -> None:
+    """Start a server, and wait until its engine is ready."""
     server = subprocess.Popen(
         [sys.executable, "-m", "talkcli", "serve", "--player", "null", "--rate", "120"],
         env=env,
@@ -145,22 +153,23 @@ def _serve(stack: contextlib.ExitStack, env: dict[str, str]) -> None:
     stack.enter_context(server)
     stack.callback(server.terminate)
     assert server.stderr
-    told = ""
+    log = ""
     for line in server.stderr:
-        told += line
+        log += line
         if "engine ready" in line:
             return
-    raise SystemExit(f"the server doesn't start: {told}")
+    raise SystemExit(f"the server did not start: {log}")
 
 
 def _end(shell: int, terminal: int) -> None:
+    """Kill the shell, and close its terminal."""
     os.close(terminal)
     os.kill(shell, signal.SIGKILL)
     os.waitpid(shell, 0)
 
 
 class _Typist:
-    """Types at a terminal, and keeps what it shows."""
+    """Types in a terminal, and records what the terminal shows."""
 
     def __init__(self, terminal: int) -> None:
         self.frames = [Frame(0.0, ((),))]
@@ -169,36 +178,39 @@ class _Typist:
         self._began = time.monotonic()
 
     def press(self, keys: str) -> None:
+        """Type the given keys."""
         os.write(self._terminal, keys.encode())
 
     def watch(self, seconds: float) -> None:
-        """Look at the screen for so long."""
+        """Record the screen for some seconds."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             self._draw(left)
 
     def watch_until(self, seen: Callable[[str], bool]) -> None:
-        """Look at the screen until its last row is like this."""
-        end = time.monotonic() + LIMIT
+        """Record the screen until its last row meets a condition."""
+        end = time.monotonic() + COMMAND_LIMIT_S
         while not seen(self._screen.last()):
             self._draw(end - time.monotonic())
             if time.monotonic() > end:
-                raise SystemExit(f"this is still shown: {self._screen.last()!r}")
+                raise SystemExit(f"the terminal still shows {self._screen.last()!r}")
 
     def _draw(self, seconds: float) -> None:
+        """Wait for output, and record the new screen."""
         if select.select([self._terminal], [], [], max(seconds, 0))[0]:
             self._screen.draw(os.read(self._terminal, 65536).decode())
             self.frames.append(self._screen.frame(time.monotonic() - self._began))
 
 
 def _type(terminal: int, speed: float) -> list[Frame]:
+    """Type all commands one after another, and record the screen."""
     typist = _Typist(terminal)
     for command in COMMANDS:
         typist.watch_until(PROMPT.__eq__)
-        typist.watch(READ * speed)
+        typist.watch(READ_S * speed)
         for key in command:
             typist.press(key)
-            typist.watch(KEY * speed)
+            typist.watch(KEY_S * speed)
         typed = f"{PROMPT}{command}"
         typist.watch_until(typed.__eq__)
         typist.press("\n")
@@ -208,13 +220,13 @@ def _type(terminal: int, speed: float) -> list[Frame]:
 
 
 def plain(frame: Frame) -> list[str]:
-    """Return a screen as text."""
-    return ["".join(each for each, _ in row).rstrip() for row in frame.rows]
+    """Return the rows of a screen as text."""
+    return ["".join(character for character, _ in row).rstrip() for row in frame.rows]
 
 
 def picture(frames: list[Frame]) -> str:
-    """Return the SVG."""
-    whole = frames[-1].at + REST
+    """Return the picture as SVG."""
+    whole = frames[-1].at + REST_S
     count = max(len(each.rows) for each in frames)
     width, height = round(COLUMNS * WIDTH) + 2 * EDGE, count * HEIGHT + 2 * EDGE
     rules, rows = [], []
@@ -237,21 +249,27 @@ def picture(frames: list[Frame]) -> str:
 
 
 def _lives(frames: list[Frame], number: int, whole: float) -> list[tuple[Row, float, float]]:
-    """Return what a row showed, from when to when; nothing is not shown."""
-    found: list[tuple[Row, float, float]] = []
+    """Return when each content of a row appears and disappears.
+
+    Omit empty contents.
+    """
+    contents: list[tuple[Row, float, float]] = []
     before: Row = ()
     since = 0.0
     for at, rows in [*frames, Frame(whole, ())]:
         row = rows[number] if number < len(rows) else ()
         if row != before:
             if before and at > since:
-                found.append((before, since, at))
+                contents.append((before, since, at))
             before, since = row, at
-    return found
+    return contents
 
 
 def _drawn(row: Row, top: float) -> str:
-    """Return a row: runs of the same attributes, each at its place, so that a font's own widths don't matter."""
+    """Return the SVG of a row.
+
+    Each run of equal attributes has its own position, whatever the width of the font.
+    """
     parts, column = [], 0
     while column < len(row):
         attributes = row[column][1]
@@ -272,6 +290,6 @@ def _drawn(row: Row, top: float) -> str:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("file", nargs="?", type=Path, default=HERE / "talk.svg")
-    parser.add_argument("--fast", action="store_true", help="don't type like a person: for the test")
+    parser.add_argument("--fast", action="store_true", help="type without pauses, for the test")
     given = parser.parse_args()
     given.file.write_text(picture(record(0.0 if given.fast else 1.0)), encoding="utf-8")

@@ -47,7 +47,7 @@ def cancel(options: CommonOptions, ids: tuple[str, ...], current: bool, before: 
 
 
 def status(options: CommonOptions, goal_id: str | None, long: bool) -> None:
-    """Show the status of the server or, if an id is given, the details of this goal."""
+    """Show the server's status, or the details of a goal if an id is given."""
     from talkcli.goals.goal import Goal
     from talkcli.terminal.goals import goal_lines, status_lines
 
@@ -62,7 +62,7 @@ def status(options: CommonOptions, goal_id: str | None, long: bool) -> None:
 
 
 def watch(options: CommonOptions, words: bool, long: bool) -> int:
-    """Show the events of all goals until interrupted, and return the exit code."""
+    """Show the events of all goals until interrupted."""
     from talkcli.cli.interrupts import Interrupts, has_reader
     from talkcli.terminal.transcript import Transcript
 
@@ -87,7 +87,7 @@ def log(options: CommonOptions, count: int, long: bool) -> None:
 
 
 def voices(options: CommonOptions, language: str | None) -> None:
-    """List the engine's voices, or only the voices for a language and its variants."""
+    """List the engine's voices, or only those for one language."""
     from talkcli.terminal.goals import voice_lines
 
     with options.connect() as client:
@@ -137,7 +137,7 @@ def resume(options: CommonOptions) -> None:
 
 
 def _report_pause(options: CommonOptions, goal: Goal | None, *, paused: bool, message: str) -> None:
-    """Report that speech has been paused or resumed, as JSON or with this message."""
+    """Report that speech has been paused or resumed."""
     if options.json:
         show_json({"paused": paused, "goal": None if goal is None else goal.to_json()})
     elif not options.quiet:
@@ -145,7 +145,7 @@ def _report_pause(options: CommonOptions, goal: Goal | None, *, paused: bool, me
 
 
 def doctor(options: CommonOptions, silent: bool) -> int:
-    """Run the doctor's checks, show the findings and the next step, and return the exit code."""
+    """Run the doctor's checks, and show the findings and the next step."""
     from talkcli.cli.interrupts import Interrupts
     from talkcli.doctor.report import format_conclusion, format_finding, next_step
     from talkcli.goals.states import EXIT_CODES, State
@@ -169,7 +169,7 @@ def doctor(options: CommonOptions, silent: bool) -> int:
 def _create_examination(
     options: CommonOptions, interrupt: Mapping[int, int], *, silent: bool
 ) -> examine.LocalExamination | broker.BrokerExamination:
-    """Return an object that checks this machine or, if a robot is selected, the connection to it."""
+    """Create the object that runs the doctor's checks."""
     robot = named_robot(options.robot, options.socket)
     if robot is None:
         from talkcli.doctor.examine import LocalExamination
@@ -184,7 +184,7 @@ def _create_examination(
 
 
 def _show_canceled(done: Canceled, options: CommonOptions) -> None:
-    """Print the ids of the cancelled goals, and a message for each goal that had already ended."""
+    """Report which goals were cancelled and which had already ended."""
     for goal in done.canceled:
         if options.json:
             show_json(goal.to_json())
@@ -196,7 +196,7 @@ def _show_canceled(done: Canceled, options: CommonOptions) -> None:
 
 
 def _suggest_key(key: str, client: Client) -> None:
-    """Print a message that suggests a similar key of an unfinished goal, if there is one."""
+    """Suggest the key of an unfinished goal if it is similar."""
     from talkcli.terminal.text import printable
 
     try:
@@ -209,7 +209,7 @@ def _suggest_key(key: str, client: Client) -> None:
 
 
 def _describe_missing_voice(language: str, voices: Iterable[JsonObject]) -> str:
-    """Return the error message for a language that has no voice, with a suggestion."""
+    """Return the error message for a language without a voice."""
     from talkcli.goals.options import is_neural
     from talkcli.terminal.text import printable
 
@@ -227,5 +227,5 @@ def _describe_missing_voice(language: str, voices: Iterable[JsonObject]) -> str:
 
 
 def _language_code(voice: JsonObject) -> str:
-    """Return the language code of a voice in lower case, or an empty string if it has none."""
+    """Return the language code of a voice in lower case."""
     return str(voice.get("language") or "").lower()

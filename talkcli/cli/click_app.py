@@ -61,7 +61,7 @@ class _OptionType(click.FloatRange):
         super().__init__(*option.limits, min_open=option.excludes_minimum)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Parse the value of an option, or raise BadParameter with the name of the option or variable."""
+        """Parse the value of an option, or raise BadParameter."""
         try:
             return read_value(self._option, str(value))
         except ValueError as error:
@@ -74,12 +74,15 @@ class _OptionType(click.FloatRange):
             raise click.BadParameter(str(error), ctx, param, source) from error
 
     def _describe_range(self) -> str:
-        """Return the range of valid numbers, as click shows it in help."""
+        """Return the range of valid numbers as text for click's help."""
         return self._option.range
 
 
 def _make_click_option(option: Option, *, common: bool = False) -> click.Option:
-    """Create the click version of an option. The value of a common option is stored in CommonOptions."""
+    """Create the click version of an option.
+
+    The value of a common option is stored in CommonOptions.
+    """
     flag = not option.takes_argument
     return click.Option(
         [*option.flags.split(", "), option.name],
@@ -118,7 +121,7 @@ def _make_click_argument(argument: Option) -> click.Argument:
 
 
 def _make_completer(name: str) -> Callable[..., list[CompletionItem]] | None:
-    """Create the function that click calls to complete a value, or return None if the name is empty."""
+    """Create the function with which click completes a value."""
 
     def complete(context: click.Context, _: click.Parameter, incomplete: str) -> list[CompletionItem]:
         from talkcli.cli import completion
@@ -129,7 +132,7 @@ def _make_completer(name: str) -> Callable[..., list[CompletionItem]] | None:
 
 
 def _store_common(context: click.Context, parameter: click.Parameter, value: object) -> None:
-    """Store the value of a common option in the CommonOptions object, unless the value is empty."""
+    """Store the value of a common option in the CommonOptions object."""
     if value:
         setattr(context.ensure_object(CommonOptions), parameter.name or "", value)
 
@@ -165,7 +168,7 @@ class _HelpfulCommand(click.Command):
     def write_options(
         self, heading: str, parameters: Iterable[click.Parameter], ctx: click.Context, formatter: click.HelpFormatter
     ) -> None:
-        """Write the help of some options, if there are any."""
+        """Write the help texts of these options, if there are any."""
         records = [each.get_help_record(ctx) for each in parameters if isinstance(each, click.Option)]
         if records:
             with formatter.section(heading):
@@ -190,16 +193,19 @@ class ClickCommand(_HelpfulCommand):
         )
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the help of the command's own options, but not that of the common options."""
+        """Write the help texts of the command's own options, without the common options."""
         self.write_options("Options", (each for each in self.params if each.expose_value), ctx, formatter)
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the table of exit codes, if there is one, and a reference to `talk --help`."""
+        """Write the table of exit codes and a reference to `talk --help`."""
         super().format_epilog(ctx, formatter)
         formatter.write("\nCommon options and exit codes: talk --help\n")
 
     def _run(self, **given: Any) -> int | None:
-        """Run the command with these values, or raise a click.UsageError if they can't be combined."""
+        """Run the command, and return its exit code.
+
+        Raise a click.UsageError if its options can't be combined.
+        """
         context = click.get_current_context()
         options: CommonOptions = context.obj
         source = context.get_parameter_source
@@ -210,7 +216,7 @@ class ClickCommand(_HelpfulCommand):
         return self.row.run(options, given)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the arguments, and raise a click.UsageError for extra ones, except during completion."""
+        """Parse the arguments, and raise a click.UsageError if there are too many."""
         ctx.allow_extra_args = True  # extra arguments are reported below
         try:
             rest = super().parse_args(ctx, args)
@@ -224,7 +230,7 @@ class ClickCommand(_HelpfulCommand):
 
 
 class _CommandGroup(_HelpfulCommand, click.Group):
-    """The group of all commands, which are created when they are first needed."""
+    """The group of all commands, each created when it is first used."""
 
     examples, exit_codes = _EXAMPLES, ALL_EXIT_CODES
 
@@ -239,7 +245,10 @@ class _CommandGroup(_HelpfulCommand, click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Return the command's name, the command and its arguments. Raise an error with a hint if it is unknown."""
+        """Return a command's name, the command and its arguments.
+
+        Raise click.UsageError for an unknown command.
+        """
         unknown = args[0] not in COMMANDS and args[0][:1] not in ("", "-")
         if unknown and not ctx.resilient_parsing:  # errors aren't shown during completion
             raise click.UsageError(_describe_unknown_command(args), ctx)
@@ -262,7 +271,7 @@ class _CommandGroup(_HelpfulCommand, click.Group):
 @click.version_option(__version__, prog_name="talk", message="%(prog)s %(version)s")
 @click.pass_context
 def talk(context: click.Context) -> None:
-    """Print an overview if no command is given. Click calls this before it runs a command."""
+    """Print an overview if no command is given."""
     if context.invoked_subcommand is None:
         click.echo(_first_screen(context))
 
@@ -282,7 +291,7 @@ def _first_screen(context: click.Context) -> str:
 
 
 def run(arguments: list[str]) -> int:
-    """Run a command line or print its completions, and return the exit code."""
+    """Run a command line, or print its completions."""
     options = CommonOptions()
     if "_TALK_COMPLETE" in os.environ:
         from talkcli.cli import completion
@@ -292,7 +301,10 @@ def run(arguments: list[str]) -> int:
 
 
 def _run_group(arguments: list[str], options: CommonOptions) -> object:
-    """Return the result of a command line that click runs. Report click's errors, and return their exit codes."""
+    """Run a command line with click, and return its result.
+
+    Report click's errors, and return their exit codes.
+    """
     try:
         with talk.make_context("talk", [*arguments], obj=options) as context:
             return talk.invoke(context)
@@ -315,7 +327,7 @@ def _run_group(arguments: list[str], options: CommonOptions) -> object:
 
 
 def _write_lines(text: str, formatter: click.HelpFormatter) -> None:
-    """Write each line of a text at the formatter's current indentation, without wrapping it."""
+    """Write the lines of a text, indented but not wrapped."""
     for line in text.strip().splitlines():
         formatter.write(f"{'':{formatter.current_indent}}{line.strip()}\n")
 

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from talkcli.cli.show import CommonOptions
 
     ExitCodes = Mapping[int | str, str]
-    #: A function that returns an error message if the given options can't be combined. Its arguments are the values of
-    #: all options, by name, and the names of the options that were given on the command line.
+    #: A function that returns an error message if options can't be combined. It receives the values of all options by
+    #: name, and the names of the options that were given.
     Rule = Callable[[Mapping[str, Any], frozenset[str]], str | None]
 
 #: The path of an output file.
@@ -33,14 +33,14 @@ _SINGLE_ROBOT_OPTIONS = ("lines", "ahead", "stream", "feedback", "output")
 
 #: All exit codes, for `talk --help`. The help of some commands describes them more specifically.
 ALL_EXIT_CODES: ExitCodes = {
-    0: "the goal was accepted; with --wait: all of it was played",
+    0: "the goal was accepted; with --wait: it was played to the end",
     1: "any other error; if it is a bug in talk, TALK_DEBUG=1 prints a traceback",
     2: "wrong usage",
     3: "no server, no broker, or the robot is offline; nothing was spoken, so you can try again",
     4: "aborted: the engine or the sound failed, or the text can't be spoken",
     5: "rejected: the goal was never queued (bad text, full queue, too many clients)",
     6: "recalled: the goal was removed from the queue before it was spoken",
-    7: "preempted: the goal was stopped while it was spoken",
+    7: "preempted: the goal was stopped while it was being spoken",
     8: "unknown goal",
     9: "the server's version doesn't fit this client",
     10: "permission denied",
@@ -63,11 +63,11 @@ class Command:
     description: str
     #: example command lines, one per line
     examples: str
-    #: the function that runs the command, as "module:name", or an empty string for the function in `ask` with the
-    #: command's name; the arguments of the function are the common options and the command's own
+    #: the function that runs the command, as "module:name". If empty, the function in `ask` with the command's name is
+    #: used. Its arguments are the common options and the command's own.
     function: str = ""
     options: tuple[Option, ...] = ()
-    #: the positional argument; it accepts any number of words if its metavar ends with "..."
+    #: the positional argument, which takes any number of words if its metavar ends with "..."
     argument: Option | None = None
     #: whether the command may connect even if the server has reached its client limit
     urgent: bool = False
@@ -77,14 +77,14 @@ class Command:
     uses_server: bool = True
     #: whether --connect-timeout can be used with the command
     connects: bool = True
-    #: the function that sends the command to several robots, as "module:name", or an empty string
+    #: the function that sends the command to several robots, as "module:name"
     fleet_function: str = ""
     rule: Rule | None = None
-    #: the meanings of the exit codes that help shows, or None if it shows none
+    #: the exit codes to show in the help, with their meanings
     exit_codes: ExitCodes | None = None
 
     def usage_fault(self, given: Mapping[str, Any], typed: frozenset[str], common: Mapping[str, Any]) -> str | None:
-        """Return an error message if an option is invalid or options can't be combined, otherwise None.
+        """Return an error message if options are invalid or can't be combined.
 
         Args:
             given: the values of the command's own options and of its argument, by name.
@@ -93,9 +93,7 @@ class Command:
         """
         robot, socket, connect_timeout = (common.get(each) for each in ("robot", "socket", "connect_timeout"))
         if robot is not None and socket:
-            return (
-                "--robot names a robot of a fleet, but --socket names a server of this machine; leave out one of them"
-            )
+            return "--robot and --socket can't be combined; leave out one of them"
         is_local = self._is_local(given)
         local_name = f"{self.name}{' --output' * (given.get('output') is not None)}"
         if is_local and robot is not None:
@@ -115,7 +113,7 @@ class Command:
         return not self.uses_server or given.get("output") is not None
 
     def _robot_fault(self, robot: str, given: Mapping[str, Any], connect_timeout: float | None) -> str | None:
-        """Return an error message if the command can't be sent to this robot or these robots, otherwise None."""
+        """Return an error message if the command can't be sent to the selected robots."""
         from talkcli.fleet.desk.request import Selection, selects_several
 
         if selects_several(robot):
@@ -128,7 +126,10 @@ class Command:
         return Selection(robot).fault
 
     def run(self, options: CommonOptions, given: Mapping[str, Any]) -> int | None:
-        """Run the command on this machine, one robot or several robots. Return its exit code, or None for success."""
+        """Run the command on this machine or on robots.
+
+        Return its exit code, or None for success.
+        """
         options.urgent = self.urgent
         function = self.function or f"ask:{self.name}"
         robot = None if self._is_local(given) else named_robot(options.robot, options.socket)
@@ -162,13 +163,13 @@ COMMON_OPTIONS = (
     option(
         "--socket",
         PATH,
-        "Set the path of the server's socket.  [env var: TALK_SOCKET; default: the usual places, see 'talk doctor']",
+        "Set the path of the server's socket.  [env var: TALK_SOCKET; default: search the usual places]",
         completion="files",
     ),
     option(
         "--robot",
         WORD,
-        "Use a robot of a fleet, through the broker TALK_BROKER. A pattern, @GROUP or @all selects several robots.  "
+        "Send the command to this robot through TALK_BROKER. A pattern, @GROUP or @all selects several robots.  "
         "[env var: TALK_ROBOT]",
         metavar="NAME",
         completion="robots",
@@ -182,19 +183,19 @@ COMMON_OPTIONS = (
         metavar="SEC",
     ),
     option("--insecure", FLAG, "Send the password to the broker without TLS."),
-    option("--json", FLAG, "Print JSON objects, one per line, also for errors."),
+    option("--json", FLAG, "Print results and errors as JSON objects, one per line."),
     option("-q, --quiet", FLAG, "Print errors only."),
 )
 
 
 def long_flag(option: Option, value: object = None) -> str:
-    """Return the long flag of an option, such as --preempt, or the negative one if `value` is False."""
+    """Return an option's long flag, such as --preempt, or its negative one if the value is False."""
     forms = option.flags.split("/")
     return (forms[-1] if value is False else forms[0]).split(", ")[-1]
 
 
 def read_value(option: Option, text: str) -> Any:
-    """Parse and check the text of an option's value, and return the value.
+    """Parse and check the value of an option.
 
     Raises:
         ValueError: the text isn't a valid value. The message says why.
@@ -212,7 +213,7 @@ def read_value(option: Option, text: str) -> Any:
     if option.choices and text not in option.choices:
         raise ValueError(f"must be one of {', '.join(option.choices)}, got '{text}'")
     if not text and kind in (WORD, ID, PATH):  # an empty value usually comes from an unset variable
-        raise ValueError("must not be empty; check the variable that it comes from")
+        raise ValueError("must not be empty; check the variable that should contain the value")
     return text
 
 
@@ -260,14 +261,16 @@ def _format_byte(character: str) -> str:
 
 
 def replace_bad_bytes(text: str, first_line: int = 1) -> tuple[str, str | None]:
-    """Return a text with invalid UTF-8 replaced by U+FFFD, and a message about it, or None if there was none.
+    """Replace invalid bytes in a text with U+FFFD.
+
+    Return the text, and a message about the replaced bytes.
 
     Args:
         text: the text, with invalid bytes decoded to surrogates.
         first_line: the number of the text's first line.
 
     Returns:
-        The text, and a message about the replaced bytes, or None if there were none.
+        The text and the message. The message is None if all bytes were valid.
     """
     if text.isascii():
         return text, None
@@ -278,9 +281,7 @@ def replace_bad_bytes(text: str, first_line: int = 1) -> tuple[str, str | None]:
     first = found[0]
     line = first_line + text.count("\n", 0, first)
     column = first - text.rfind("\n", 0, first)
-    words = (
-        f"line {line}, column {column}: the byte {_format_byte(text[first])} is not valid UTF-8, so it is not spoken"
-    )
+    words = f"line {line}, column {column}: the byte {_format_byte(text[first])} is not valid UTF-8 and is skipped"
     if len(found) > 1:
         words += f" ({len(found) - 1:,} more like it)"
     # The engine treats the replacement character U+FFFD as a space.
@@ -288,7 +289,7 @@ def replace_bad_bytes(text: str, first_line: int = 1) -> tuple[str, str | None]:
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
-    """Return the known word that is most similar to this one, or None if there is no close match."""
+    """Return the closest match among the known words, if there is one."""
     import difflib
 
     by_name = {each.lower(): each for each in known}

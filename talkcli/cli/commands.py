@@ -27,8 +27,8 @@ def _timeout_option(help_text: str) -> Option:
 
 
 def _print_unit_option(*names: str) -> Option:
-    """Return a --print-unit option that accepts these names of units."""
-    words = f"Print a systemd unit that uses the other options, and exit. UNIT is one of {', '.join(names)}."
+    """Return a --print-unit option with a choice of units."""
+    words = f"Print a systemd unit with the given options, and exit. UNIT is one of {', '.join(names)}."
     return option("--print-unit", TEXT, words, metavar="UNIT", choices=names)
 
 
@@ -40,13 +40,13 @@ def _say_options() -> Iterator[Option]:
         if each.name == "wait":
             yield _timeout_option("With --wait, cancel the sentence after SEC seconds. The time in the queue counts.")
         elif each.name == "id":
-            what = "Name the sender. The name is shown in the log."
+            what = "Set the sender's name, which is shown in the log."
             yield Option("name", WORD, special_flags="--as", metavar="NAME", help=what, env="TALK_NAME")
     yield option("--lines", FLAG, "Speak each line of standard input as it arrives.")
     words = "With --lines, keep at most N lines in the server's queue.  [default: 10]"
     yield option("--ahead", INTEGER, words, limits=(1, MAX_QUEUED_GOALS))
     yield option("--stream", FLAG, "Speak standard input as one text, while it arrives.")
-    words = "Write a WAV file instead of speaking. This needs no server, and '-' is standard output."
+    words = "Write the speech to a WAV file. '-' means standard output. No server is needed."
     yield option("-o, --output", OUTPUT_FILE, words, metavar="FILE.wav")
 
 
@@ -58,7 +58,7 @@ _OTHER_EXTENSIONS = (".aac", ".aiff", ".au", ".flac", ".m4a", ".mp3", ".mp4", ".
 
 
 def _say_fault(given: Mapping[str, Any], typed: frozenset[str]) -> str | None:
-    """Return why these options of `say` can't be combined, as an error message, or None if they can."""
+    """Return an error message if options of `say` can't be combined."""
     output, waits = given["output"], given["wait"] or given["feedback"]
     if output is not None:
         named = [long_flag(each, given[each.name]) for each in _SAY_OPTIONS if each.name in typed - _SERVERLESS_OPTIONS]
@@ -66,18 +66,18 @@ def _say_fault(given: Mapping[str, Any], typed: frozenset[str]) -> str | None:
             return f"--output writes a file without a server; leave out {', '.join(named)}"
         extension = os.path.splitext(output)[1]
         if extension.lower() in _OTHER_EXTENSIONS:
-            return f"--output writes WAV, not {extension}; name the file .wav, and convert it with ffmpeg or sox"
+            return "--output can only write WAV files; name the file .wav, and convert it with ffmpeg or sox"
     if fault := _input_fault(given, typed):
         return fault
     if given["flush"] and given["preempt"] is False:
-        return "--flush interrupts, but --queue waits; leave out one of them"
+        return "--flush and --queue can't be combined; leave out one of them"
     if given["timeout"] is not None and not waits and output is None:
         return "--timeout only works with --wait; add --wait, or leave out --timeout"
     return None
 
 
 def _input_fault(given: Mapping[str, Any], typed: frozenset[str]) -> str | None:
-    """Return why TEXT can't be combined with the options that read standard input, or None if it can."""
+    """Return an error message if TEXT can't be combined with the options that read standard input."""
     text = given["text"]
     if given["stream"] and (given["lines"] or text not in {(), ("-",)}):
         return "--stream speaks standard input as one text; leave out TEXT and --lines"
@@ -111,9 +111,9 @@ _SERVE_OPTIONS = (
     option(
         "--player",
         TEXT,
-        "Choose the player. Besides pulse (the sound server), aplay, pacat and pw-cat, there are null (no sound, same "
-        "timing) and file:PATH.wav. Anything else is a command that reads 16-bit mono PCM. {rate} and {device} in the "
-        "command are replaced. [default: the first of pulse, aplay, pacat and pw-cat that works]",
+        "Choose the player. It is pulse (the sound server), aplay, pacat, pw-cat, null (no sound, but usual timing), "
+        "file:PATH.wav, or a command that reads 16-bit mono PCM. In a command, {rate} and {device} are replaced by "
+        "their values. [default: the first of pulse, aplay, pacat and pw-cat that works]",
         metavar="PLAYER",
         env="TALK_PLAYER",
         completion="players",
@@ -121,15 +121,15 @@ _SERVE_OPTIONS = (
     option(
         "--device",
         TEXT,
-        "Play to this device. Also set --player, because each player has its own names for devices: see 'aplay -L' for "
-        "aplay, 'pactl list short sinks' for pulse and pacat, and 'pw-cli ls Node' for pw-cat.",
+        "Play to this device. Device names depend on the player, so also set --player. To list the names, use "
+        "'aplay -L' for aplay, 'pactl list short sinks' for pulse and pacat, or 'pw-cli ls Node' for pw-cat.",
         metavar="NAME",
     ),
     option(
         "--lead-in",
         INTEGER,
-        "Play MS milliseconds of silence if the output was idle. This wakes HDMI, USB and Bluetooth outputs before a "
-        "sentence, so that they don't swallow its first word.",
+        "Play MS milliseconds of silence if the output was idle. HDMI, USB and Bluetooth outputs then don't swallow "
+        "the first word.",
         default=0,
         limits=(0, goal_options.MAX_LEAD_IN_MS),
         metavar="MS",
@@ -138,12 +138,13 @@ _SERVE_OPTIONS = (
     option(
         "--voice-memory",
         INTEGER,
-        "Let neural voices use about MB megabytes of memory. Above that, unload the least recently used voice.",
+        "Let neural voices use about MB megabytes of memory. Above this limit, the least recently used voice is "
+        "unloaded.",
         default=300,
         limits=(0, 100_000),
         metavar="MB",
     ),
-    option("--driver", TEXT, "Use this driver of pyttsx3. [default: the one for this system]", metavar="NAME"),
+    option("--driver", TEXT, "Use this pyttsx3 driver. [default: the driver for this system]", metavar="NAME"),
     option("--socket-mode", FILE_MODE, "Set the socket's file mode, which decides who may connect.", default="0600"),
     option("--greeting", TEXT, "Speak this sentence when the server starts."),
     _print_unit_option("user", "system", "user-socket", "system-socket"),
@@ -151,7 +152,7 @@ _SERVE_OPTIONS = (
 
 
 def _serve_fault(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
-    """Return why these options of `serve` can't be combined, as an error message, or None if they can."""
+    """Return an error message if options of `serve` can't be combined."""
     player = given["player"] or ""
     if given["device"] and player.startswith(("null", "file:")):
         return f"the player {player} has no devices; leave out --device"
@@ -161,14 +162,14 @@ def _serve_fault(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
 
 
 def _bridge_fault(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
-    """Return an error message if `bridge` needs a --name and none is given, otherwise None."""
+    """Return an error message if `bridge` lacks a required --name."""
     if given["name"] is None and not given["print_acl"]:
         return "--name is missing; choose the robot's name on the broker, as in: talk bridge --name anna"
     return None
 
 
 _GOAL_IDS = Option("ids", IDS, metavar=IDS.metavar, completion="goal_ids")
-_LONG = option("-l, --long", FLAG, "Show whole ids, and the senders' commands and process ids.")
+_LONG = option("-l, --long", FLAG, "Show full ids, and each sender's command and process id.")
 
 #: All commands, in the order in which help lists them. The most important ones for new users come first.
 _ROWS = (
@@ -197,12 +198,12 @@ _ROWS = (
         description="""
         Speak TEXT. If TEXT is '-', speak standard input as one sentence.
 
-        The command prints the goal's id, and returns as soon as the server has accepted the goal. With --wait, it
-        returns when the goal has ended. Ctrl-C, SIGTERM, SIGHUP or closing its output (for example when ssh
-        disconnects) then cancels the goal.
+        The command prints the goal's id, and returns as soon as the server has accepted the goal. With --wait, the
+        command returns when the goal has ended. If the command is interrupted before that, for example by Ctrl-C,
+        SIGTERM, SIGHUP or a lost ssh connection, it cancels the goal.
 
-        With --lines, the exit code is that of the first line that failed. The --ttl of a line starts when the line is
-        read.
+        With --lines, the exit code is the result of the first line that failed, and --ttl counts from the moment when
+        a line is read.
 
         With --stream, speaking begins before the text has ended, for example while a language model writes it. If the
         goal ends early, the command stops reading.
@@ -221,15 +222,15 @@ _ROWS = (
         talk say -o - "hello" | aplay
         """,
         exit_codes={
-            0: "accepted or throttled; with --wait: all of it was played",
+            0: "accepted, or skipped by --throttle; with --wait: played to the end",
             3: "no server; nothing was spoken, so you can try again",
             4: "aborted: the engine or the sound failed, or the text can't be spoken",
             5: "rejected: never queued (bad text, full queue, too many clients)",
             6: "recalled: removed from the queue before it was spoken",
-            7: "preempted: stopped while it was spoken",
+            7: "preempted: stopped while it was being spoken",
             12: "lost: the connection was lost after the goal was sent, so it may still be spoken",
             124: "timed out; the goal was cancelled",
-            "128+n": "ended by signal n; 141 means that the output was closed; with --wait, the goal was cancelled",
+            "128+n": "ended by signal n (141: the output was closed); with --wait, the goal was cancelled",
         },
         options=_SAY_OPTIONS,
         argument=Option("text", TEXT, metavar="TEXT..."),
@@ -240,8 +241,8 @@ _ROWS = (
         name="wait",
         summary="Wait until goals have ended.",
         description="""
-        Wait until these goals have ended, whoever sent them. Without an ID, wait for all active and waiting goals.
-        Nothing is cancelled.
+        Wait until the goals with these ids have ended, no matter who sent them. Without an ID, wait for the current
+        goal and all waiting goals. The command never cancels a goal.
         """,
         function="wait:wait",
         fleet_function="several:wait",
@@ -267,10 +268,10 @@ _ROWS = (
         name="cancel",
         summary="Stop speaking, or cancel some goals.",
         description="""
-        Stop speaking and empty the queue, or cancel only the goals that IDs and options select.
+        Stop speaking and empty the queue. With IDs or options, cancel only the goals that they select.
 
-        The command returns when the robot is silent, and prints the ids of the goals that it ended. If an ID is
-        unknown, the other goals are cancelled, and the exit code is 8.
+        The command returns when the robot is silent, and prints the ids of the cancelled goals. If an ID is unknown,
+        the command still cancels the other goals, and the exit code is 8.
         """,
         fleet_function="several:cancel",
         examples="""
@@ -287,7 +288,7 @@ _ROWS = (
         name="status",
         summary="Show the current sentence, the queue and the last results.",
         description="""
-        Show the server, the current sentence, the queue and the last results. With ID, show everything about one goal.
+        Show the server, the current sentence, the queue and the last results. With ID, show all details of one goal.
         """,
         fleet_function="several:status",
         examples="""
@@ -301,12 +302,12 @@ _ROWS = (
     ),
     Command(
         name="watch",
-        summary="Follow all goals as they happen.",
+        summary="Follow all goals live.",
         description="""
-        Show all goals as they happen: what is said, who sent it, and how and why it ends. Ctrl-C ends the command.
+        Show all goals live: the text, the sender, and how and why each goal ends. Press Ctrl-C to stop.
 
-        The output begins with the current sentence and the queue. In a pipe, each event is a line. On a terminal,
-        states that only last a moment are left out.
+        The output begins with the current sentence and the queue. In a pipe, each event is one line. On a terminal,
+        states that last only a moment are left out.
 
         With --json, each event and each word is an object. The first object is {"event": "snapshot", ...}.
         """,
@@ -321,10 +322,10 @@ _ROWS = (
         name="log",
         summary="Show what was said, by whom, and how it ended.",
         description="""
-        Show the goals that have ended, rejected ones included. The newest is last.
+        Show the goals that have ended, including rejected goals. The newest goal is last.
 
-        Goals of the running server are shown by number. Senders are shown by the name that they chose (in quotes), or
-        else by the program that called talk.
+        A goal of the running server is shown by its number. A sender is shown by the name that it chose (in quotes),
+        or without a name, by the program that called talk.
         """,
         examples="""
         talk log
@@ -340,10 +341,10 @@ _ROWS = (
         name="pause",
         summary="Pause speech.",
         description="""
-        Pause speech until 'talk resume'. The current sentence stops where it is, and nothing else is spoken, however
-        urgent it is. Goals can still be sent and cancelled.
+        Pause speech until 'talk resume'. The current sentence stops where it is, and no other sentence is spoken, not
+        even an urgent one. Goals can still be sent and cancelled.
 
-        The command returns when the robot is silent. If that can't be confirmed within 2 seconds, the exit code is 1.
+        The command returns when the robot is silent. If silence is not confirmed within 2 seconds, the exit code is 1.
         """,
         fleet_function="several:pause",
         examples="talk pause; listen_to_the_operator; talk resume",
@@ -359,8 +360,9 @@ _ROWS = (
         name="set",
         summary="Change or print the settings of the running server.",
         description="""
-        Change settings of the running server, or print them if no option is given. They apply from the next goal on,
-        unless a goal has its own. A restart resets them.
+        Change settings of the running server, or print the settings if no option is given. A setting applies from the
+        next goal on, except to goals that were sent with a value of their own. Restarting the server resets all
+        settings.
         """,
         function="ask:change",
         fleet_function="several:change",
@@ -374,12 +376,12 @@ _ROWS = (
         name="voices",
         summary="List the voices.",
         description="""
-        List the id, language and name of each voice. The option --voice takes any of them, a locale such as de_DE, or
-        a language such as german.
+        List the id, language and name of each voice. The option --voice accepts an id, a name, a locale such as de_DE,
+        or a language such as de or german.
 
-        Variants such as f3 can be added to an id: en-us+f3. Neural voices come last, and have no variants. Any
-        unambiguous part of their id works: joe for piper/en_US-joe-medium. NAME#3 selects a speaker by number or
-        name. If the server uses a neural voice, its language selects it, too.
+        A variant such as f3 can be added to an id: en-us+f3. Neural voices are listed last, and have no variants. Any
+        unambiguous part of a neural voice's id selects the voice: joe for piper/en_US-joe-medium. NAME#3 selects a
+        speaker by number or name. If the server uses a neural voice, the language of this voice also selects it.
         """,
         examples="""
         talk voices --language en
@@ -394,26 +396,25 @@ _ROWS = (
     ),
     Command(
         name="doctor",
-        summary="Check everything between a sentence and the loudspeaker.",
+        summary="Check everything that is needed to hear a sentence.",
         description="""
-        Check everything between a sentence and the loudspeaker, and say what to do next.
+        Check everything that is needed to hear a sentence, and say what to do next.
 
-        Each check is a line: ok, warning or failed. The last one plays a sentence. The server speaks it when its turn
-        comes, which takes at most 20 seconds. If no server runs, the command starts an engine with TALK_PLAYER and
-        TALK_VOICE.
+        Each check prints one line: ok, warning or failed. The last check sends a sentence to the server, and waits at
+        most 20 seconds for it. If no server is running, the command starts an engine with TALK_PLAYER and TALK_VOICE.
 
         With --silent, the command always starts its own engine, which plays silence through the server's player. No
         goal is delayed, and nothing is logged.
 
-        With --robot, the command checks the way to a robot of a fleet: broker, certificate, login, permissions, and
-        the robot's answer.
+        With --robot, the command checks the connection to a robot of a fleet: broker, certificate, login, permissions,
+        and the robot's answer.
         """,
         connects=False,
         examples="""
         talk doctor
         talk doctor --silent                    check everything at night
         ssh robot talk doctor                   ssh returns the exit code
-        talk doctor --robot anna                check the way to the robot anna
+        talk doctor --robot anna                check the connection to anna
         talk --json doctor | jq 'select(.state != "ok")'
         """,
         exit_codes={
@@ -429,11 +430,11 @@ _ROWS = (
         description="""
         Connect this robot to an MQTT broker, in the foreground, until SIGTERM or Ctrl-C.
 
-        Everybody who may write to the robot's topics can then make it speak. The bridge logs to standard error.
+        Anybody who may write to the robot's topics can then make the robot speak. The bridge logs to standard error.
 
-        TALK_BROKER is the address of the broker: mqtts://HOST, or mqtt://HOST without TLS. TALK_MQTT_USER and
-        TALK_MQTT_PASSWORD_FILE are the login. TALK_MQTT_CA, TALK_MQTT_CERT and TALK_MQTT_KEY name
-        certificate files.
+        TALK_BROKER is the address of the broker: mqtts://HOST, or mqtt://HOST without TLS. Set the
+        user and password with TALK_MQTT_USER and TALK_MQTT_PASSWORD_FILE, and the paths of certificate files with
+        TALK_MQTT_CA, TALK_MQTT_CERT and TALK_MQTT_KEY.
         """,
         function="services:bridge",
         uses_server=False,
@@ -444,7 +445,7 @@ _ROWS = (
         talk bridge --print-acl                       rules for the broker
         """,
         options=(
-            option("--name", WORD, "Set the robot's name. No other robot may have it.", metavar="NAME"),
+            option("--name", WORD, "Set the robot's name, which no other robot may use.", metavar="NAME"),
             option("--group", WORD, "Add the robot to these groups, separated by commas.", metavar="GROUP"),
             option(
                 "--allow",
@@ -453,7 +454,7 @@ _ROWS = (
                 default="say,cancel,status,wait,log,voices,pause,resume",
                 metavar="LIST",
             ),
-            option("--no-text", FLAG, "Publish no texts in the status and in events."),
+            option("--no-text", FLAG, "Publish the status and events without the texts of goals."),
             option("--homeassistant", FLAG, "Show the robot as a device in Home Assistant."),
             _print_unit_option("user", "system"),
             option("--print-acl", FLAG, "Print access rules for mosquitto's acl_file, and exit."),
@@ -466,8 +467,8 @@ _ROWS = (
         description="""
         Show which robots of a fleet are online, and what they say. TALK_BROKER is the address of the broker.
 
-        'status' prints a table with each robot's current sentence, the number of waiting goals, and how the last goal
-        ended and when. 'watch' shows the goals of all robots as they happen.
+        'status' prints a table with each robot's current sentence, the number of waiting goals, and the last result
+        with its time. 'watch' shows the goals of all robots live.
 
         --robot selects robots by a name, a pattern such as 'wh-*', or a group such as @warehouse.
         """,
@@ -480,7 +481,7 @@ _ROWS = (
         talk --json fleet status | jq -r 'select(.presence.online | not).robot'
         talk fleet watch
         """,
-        options=(replace(_LONG, help="Show whole ids. 'status' also shows versions and start times."),),
+        options=(replace(_LONG, help="Show full ids. 'status' also shows versions and start times."),),
         argument=Option("what", WORD, metavar="WHAT", choices=("status", "watch")),
     ),
     Command(
@@ -489,8 +490,8 @@ _ROWS = (
         description="""
         Print the completion script for bash, zsh or fish, to be loaded by the shell's start file.
 
-        Tab then completes commands, options and their values. If a server runs, Tab also completes goal ids, keys and
-        voices.
+        Tab then completes commands, options and their values. While a server runs, Tab also completes goal ids, keys
+        and voices.
         """,
         function="completion:completion",
         uses_server=False,

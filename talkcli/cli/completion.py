@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 COMPLETION_TIMEOUT_S = 0.5
 #: The maximum number of ended goals to offer.
 _MAX_ENDED_GOALS = 100
-#: The maximum length of a goal's text, or of a name, in the help text of a value.
+#: The maximum length of a text or a name in the help text of a value.
 _HELP_TEXT_CHARS = 60
 #: The file names of the completion scripts.
 _SCRIPTS = {"bash": "talk.bash", "zsh": "_talk", "fish": "talk.fish"}
@@ -51,7 +51,7 @@ _BASH_SPECIAL = re.compile(r"[^\w@%+=:,./-]")
 
 
 def print_completions(talk: click.Command, options: CommonOptions) -> int:
-    """Print the completions of the line that a shell's script has passed, and return the exit code."""
+    """Print completions for the line that the shell's completion script passes."""
     try:
         click.echo("\n".join(_completion_lines(talk, options)).encode())
     except Exception:
@@ -62,7 +62,7 @@ def print_completions(talk: click.Command, options: CommonOptions) -> int:
 
 
 def _completion_lines(talk: click.Command, options: CommonOptions) -> list[str]:
-    """Return the completions of the line in COMP_WORDS, in the format of the shell's script."""
+    """Return the completions of the line in COMP_WORDS, formatted for the script."""
     line, shell = os.environ["COMP_WORDS"], os.environ["_TALK_COMPLETE"].removesuffix("_complete")
     words = split_arg_string(line)
     # If the next character would start a new word, the word to complete is empty.
@@ -74,7 +74,7 @@ def _completion_lines(talk: click.Command, options: CommonOptions) -> list[str]:
 
 
 def _format_for_bash(word: str, value: str, _: str | None) -> str:
-    """Format a value for bash as its script expects it: quoted, and without the part that bash keeps.
+    """Quote the part of a value that bash will insert.
 
     bash replaces the text in COMP_CWORD, which may be only the last part of the word.
     """
@@ -107,7 +107,7 @@ def completion(_: CommonOptions, shell: str) -> None:
 
 
 def _last_word(line: str) -> tuple[str, str]:
-    """Return the last word of a line as typed, and its unclosed quotation mark, if any."""
+    """Return the last word of a line, and its unclosed quotation mark, if any."""
     word, quote, escaped = "", "", False
     for character in line:
         if escaped:
@@ -132,7 +132,10 @@ def _with_flag(value: str, word: str) -> str:
 
 
 def _quote_for_bash(value: str, quote: str) -> str:
-    """Escape a value for bash. `quote` is an unclosed quotation mark before it, or an empty string."""
+    """Escape a value for bash.
+
+    `quote` is an unclosed quotation mark before it, or an empty string.
+    """
     if quote == "'":
         return value.replace("'", "'\\''")
     if quote:
@@ -166,7 +169,7 @@ def complete(completer: str, options: CommonOptions, incomplete: str) -> list[Co
 
 
 def _matches(value: str, incomplete: str) -> bool:
-    """Return whether a value begins with the typed text and has no invisible characters."""
+    """Return whether a value begins with the typed text and is safe to print."""
     # Leave out values with invisible characters, because the shell would write them to the terminal unescaped.
     return bool(value) and value.startswith(incomplete) and value.isprintable()
 
@@ -178,7 +181,7 @@ def goal_ids(options: CommonOptions, incomplete: str) -> Offers:
 
 
 def known_ids(options: CommonOptions, incomplete: str) -> Offers:
-    """Return the ids of unfinished goals, followed by those of the latest ended goals, as completions."""
+    """Return the ids of unfinished and recent goals as completions."""
     with options.connect(COMPLETION_TIMEOUT_S) as client:
         status, ended = client.status(), client.log(_MAX_ENDED_GOALS)
     return _offer_ids([*unfinished(status), *reversed(ended)], status, incomplete)
@@ -196,7 +199,9 @@ def unfinished_keys(options: CommonOptions, _: str) -> Offers:
 
 
 def voices(options: CommonOptions, incomplete: str) -> Offers:
-    """Return the languages of the voices as completions. If no language matches, return voice ids or names.
+    """Return the languages of the voices as completions.
+
+    If no language matches, return voice ids or names.
 
     Neural voices are always offered by id, because there are few of them and users select them by id.
     """
@@ -234,33 +239,36 @@ def players(_: CommonOptions, __: str) -> Offers:
 
 
 def _request_status(options: CommonOptions) -> ServerStatus:
-    """Return the server's status, or raise an error if the answer takes more than half a second."""
+    """Request the server's status, with a time limit of half a second."""
     with options.connect(COMPLETION_TIMEOUT_S) as client:
         return client.status()
 
 
 def _offer_ids(goals: Iterable[Goal], status: ServerStatus, incomplete: str) -> Offers:
-    """Return the ids of goals as completions. If the user has typed digits, add short ids such as 12."""
+    """Return the ids of goals as completions.
+
+    If the user has typed digits, add short ids such as 12.
+    """
     own = f"{status.server.get('boot')}-" if incomplete.isascii() and incomplete.isdecimal() else ""
     return [(name, _goal_help(each)) for each in goals for name in dict.fromkeys((each.id.removeprefix(own), each.id))]
 
 
 def _offer_keys(goals: Iterable[Goal]) -> Offers:
-    """Return the keys of goals as completions. Goals without a key are left out."""
+    """Return the keys of goals as completions."""
     return [(each.key, _goal_help(each)) for each in goals if each.key is not None]
 
 
 def _shorten(text: str) -> str:
-    """Return a text for use in a help text: escaped, and cut to 60 characters."""
+    """Escape and shorten a text for use in a help text."""
     return printable(text, _HELP_TEXT_CHARS)
 
 
 def _goal_help(goal: Goal) -> str:
-    """Return the help text for a goal's id or key: the goal's state and text."""
+    """Return the help text for a goal's id or key."""
     return f"{goal.state.name} {_shorten(goal.text or '')}"
 
 
 def _voice_help(voice: JsonObject, field: str) -> str:
-    """Return the help text for a voice: its name and language, without the field that is offered."""
+    """Return the help text for a voice."""
     parts = [_shorten(str(voice.get(each) or "")) for each in ("name", "language") if each != field]
     return ", ".join(filter(None, parts)) or "voice"

@@ -1,4 +1,4 @@
-"""The displays for `--feedback`: JSON, plain lines, or a sentence with the current word highlighted.
+"""The displays for `--feedback`: JSON, plain lines or a highlighted sentence.
 
 These classes only display events. They never wait, and they don't know which client owns a goal.
 """
@@ -66,7 +66,7 @@ class _LineFeedback(Feedback):
         self._shown: dict[str, State] = {}
 
     def show(self, goal: Goal, event: Event) -> None:  # noqa: ARG002
-        """Print a state, a word or a pause as a line. A result is printed as a state."""
+        """Print an event as a line."""
         if isinstance(event, StateChanged):
             self._show_state(event.id, event.state)
         elif isinstance(event, WordHeard):
@@ -81,7 +81,7 @@ class _LineFeedback(Feedback):
             self._shown.pop(event.goal.id, None)
 
     def _show_state(self, goal_id: str, state: State) -> None:
-        """Print the state of a goal, unless it was the last one that was printed for this goal."""
+        """Print the state of a goal if it has changed."""
         # The end of a goal is usually reported twice, as a new state and as a result. Print it only once.
         if self._shown.get(goal_id) is not state:
             self._shown[goal_id] = state
@@ -89,7 +89,7 @@ class _LineFeedback(Feedback):
 
 
 class _TerminalFeedback(Feedback):
-    """A display that shows the sentence on one line of a terminal and highlights each word as it is heard.
+    """A display that highlights each word on a terminal as it is heard.
 
     The line is rewritten in place and is never wider than the terminal, so only part of a long text is visible. When
     the goal ends, the whole sentence is written.
@@ -104,7 +104,7 @@ class _TerminalFeedback(Feedback):
         self._resizes = _ResizeWatcher(self._paint)
 
     def begin(self, goals: Sequence[Goal]) -> None:
-        """Show the goal that is being spoken, or else the first unfinished one, if no goal is shown yet."""
+        """Show the goal that is being spoken, or else the first unfinished one."""
         unfinished = [each for each in goals if not each.state.terminal]
         if unfinished and self._line is None:
             spoken = (each for each in unfinished if each.state is not State.PENDING)
@@ -112,7 +112,7 @@ class _TerminalFeedback(Feedback):
             self._paint()
 
     def show(self, goal: Goal, event: Event) -> None:
-        """Update the line after an event. When a goal has ended, write its whole sentence."""
+        """Update the line after an event."""
         line = self._line
         if isinstance(event, Result):
             self._show_end(event.goal)
@@ -136,14 +136,14 @@ class _TerminalFeedback(Feedback):
         self._paint()
 
     def close(self) -> None:
-        """Write the current goal's whole sentence, end the line, and stop adapting it to the terminal's width."""
+        """Finish the current line, and stop watching for terminal resizes."""
         self._resizes.close()
         if self._line:
             self._write_whole(self._line)
             self._line = None
 
     def _show_end(self, goal: Goal) -> None:
-        """Write the whole sentence of a goal that has ended, and stop showing this goal."""
+        """Write the whole sentence of a goal that has ended."""
         line, ended = self._line, _GoalLine(goal)
         ended.state = goal.state
         if line and line.goal.id == goal.id:
@@ -152,7 +152,7 @@ class _TerminalFeedback(Feedback):
         self._write_whole(ended)
 
     def _write_whole(self, line: _GoalLine) -> None:
-        """Write a goal's state and its whole sentence, which may take several lines."""
+        """Write a goal's state and its whole sentence."""
         ended = line.state is State.SUCCEEDED
         heard, unheard = (line.text.whole, "") if ended else line.text.split(line.word[1])
         with self._writing:
@@ -162,7 +162,7 @@ class _TerminalFeedback(Feedback):
             )
 
     def _paint(self) -> None:
-        """Rewrite the current goal's line on the terminal, if a goal is shown."""
+        """Repaint the current goal's line on the terminal."""
         with self._writing:
             line = self._line  # another thread may set `_line` to None
             if line:
@@ -229,7 +229,7 @@ class _GoalLine:
         self.text.extend(text[len(self.text) :])
 
     def render(self) -> str:
-        """Return the line as text with terminal codes, cut to the width of the terminal."""
+        """Return the line with terminal codes, cut to the terminal's width."""
         # Leave the last column free, because some terminals start a new line as soon as it is filled.
         columns = terminal_columns(sys.stdout) - 1
         state = self.state.name
@@ -244,12 +244,12 @@ class _GoalLine:
 
 
 def _is_spoken(event: Event) -> bool:
-    """Return whether this event means that its goal is being spoken."""
+    """Return whether an event shows that its goal is being spoken."""
     return isinstance(event, WordHeard) or (isinstance(event, StateChanged) and event.state is State.ACTIVE)
 
 
 def _write(text: str) -> None:
-    """Write to the terminal without buffering, and wait if the terminal isn't ready."""
+    """Write to the terminal without buffering."""
     data = text.encode(errors="backslashreplace")
     fd = sys.stdout.fileno()
     while data:

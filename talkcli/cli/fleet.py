@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def fleet(options: CommonOptions, what: str, long: bool) -> int | None:
-    """Show the state of each selected robot or, if `what` is "watch", their events until interrupted.
+    """Show the robots of a fleet, or watch their events.
 
     Return the exit code, or None for success.
     """
@@ -56,7 +56,7 @@ def _no_robot_error(broker: Broker, selection: Selection | None) -> ServerUnavai
 
 
 def _watch(options: CommonOptions, broker: Broker, selection: Selection | None, *, long: bool) -> int:
-    """Show the events of the selected robots until the command is interrupted, and return the exit code."""
+    """Show the events of the selected robots until interrupted."""
     from talkcli.cli.interrupts import Interrupts, has_reader
     from talkcli.fleet.desk.watch import FleetWatch
 
@@ -73,7 +73,10 @@ def _watch(options: CommonOptions, broker: Broker, selection: Selection | None, 
 def _show_event(
     options: CommonOptions, broker: Broker, transcript: FleetTranscript, event: FleetEvent, output: Screen
 ) -> None:
-    """Print an event of the fleet. Messages about a lost or recovered broker go to standard error."""
+    """Print an event of the fleet.
+
+    Messages about a lost or recovered broker go to standard error.
+    """
     from talkcli.fleet.desk.watch import BrokerAway, EventsMissed, FleetSnapshot, RobotChanged, RobotEvent
 
     now = time.time()
@@ -94,11 +97,11 @@ def _show_event(
         show_result(options, [_snapshot_object(event.robot)], lambda: lines)
     elif not options.quiet:
         if isinstance(event, BrokerAway):
-            note(f"{event.why}; trying again for {event.limit:g} s")
+            note(f"{event.why}; reconnecting for up to {event.limit:g} s")
         else:
             note(f"the broker at {broker.url} is back after {event.after:.1f} s")
 
 
 def _snapshot_object(robot: RobotInfo) -> JsonObject:
-    """Return the JSON object in which `talk fleet watch` prints the whole state of a robot."""
+    """Return the JSON object for a robot's whole state."""
     return {"robot": robot.presence.name, "event": "snapshot", **robot.to_json()}

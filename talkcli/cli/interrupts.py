@@ -69,7 +69,7 @@ class Interrupts:
 
     @property
     def exit_code(self) -> int:
-        """The command's exit code after a signal or closed output has ended the wait."""
+        """The command's exit code after an interrupted wait."""
         return EXIT_SIGPIPE if self.signal_number is None else EXIT_SIGNAL + self.signal_number
 
     def __enter__(self) -> Interrupts:
@@ -103,7 +103,9 @@ class Interrupts:
         return kind is Interrupted
 
     def record(self, error: Interrupted | OSError) -> None:
-        """Record whether the output's reader is gone, and if so, discard all output. Raise unrelated errors again.
+        """Record whether the output's reader is gone.
+
+        If it is, discard all output. Re-raise unrelated errors.
 
         The unrelated errors are those other than an interrupt, a timeout or a missing reader.
         """
@@ -117,7 +119,10 @@ class Interrupts:
             discard_output()
 
     def prepare_cleanup(self) -> None:
-        """Clear the interrupt, so that the cleanup after it can wait. Only a new signal can interrupt the cleanup."""
+        """Clear the interrupt so that the cleanup can wait.
+
+        Only a new signal interrupts the cleanup.
+        """
         if self.signal_number is not None:
             signal.set_wakeup_fd(-1)  # a second SIGHUP must not interrupt the cleanup
         self.watched.pop(STDOUT_FD, None)
@@ -125,7 +130,7 @@ class Interrupts:
             os.read(self._descriptor, 16)
 
     def _handle_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
-        """Record the first signal. At a second one, exit the process, or ignore it if it is SIGHUP."""
+        """Record the first signal. Exit the process on a second signal, unless that is SIGHUP."""
         if self.signal_number is not None:
             if number == signal.SIGHUP:
                 return

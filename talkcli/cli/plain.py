@@ -59,7 +59,7 @@ def read(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand |
 
 
 def _parse(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand | None:
-    """Parse a command line. If click has to parse it, return None or raise an error."""
+    """Try to parse a command line without click."""
     command: Command | None = None
     words: list[str] = []
     given: dict[str, Any] = {}
@@ -78,7 +78,7 @@ def _parse(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand
 
 
 def _flag_table(options: Iterable[Option]) -> Flags:
-    """Return each flag's option, and the value that the flag sets if it takes no argument."""
+    """Return a table of the flags and their options."""
     found: Flags = {}
     for option in options:
         yes, _, no = option.flags.partition("/")
@@ -89,7 +89,7 @@ def _flag_table(options: Iterable[Option]) -> Flags:
 
 
 def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, Any]) -> None:
-    """Parse an option, whose value may be the next word in `rest`, and store the value in `given`.
+    """Parse an option, and store its value in `given`.
 
     Raises:
         KeyError, ValueError, StopIteration: click has to parse the option.
@@ -97,7 +97,7 @@ def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, 
     name, equals, text = word.partition("=")
     option, value = flags[name]
     if option.kind is OUTPUT_FILE or (equals and not (option.takes_argument and name[:2] == "--")):
-        raise ValueError(f"{word} isn't a plain option")
+        raise ValueError(f"click has to parse {word}")
     takes_argument = option.takes_argument
     given[option.name] = read_value(option, text if equals else next(rest)) if takes_argument else value
 
@@ -105,7 +105,7 @@ def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, 
 def _build_command(
     command: Command, given: dict[str, Any], words: list[str], environment: Mapping[str, str]
 ) -> PlainCommand | None:
-    """Return the command with its argument and default values, or None if click has to report an error."""
+    """Create the command from its parsed options and argument."""
     common = {name: given.pop(name) for name in _COMMON_NAMES & given.keys()}
     typed = frozenset(given)
     for option in command.options:
@@ -124,7 +124,7 @@ def _build_command(
 
 
 def run(plain: PlainCommand) -> int:
-    """Run a parsed command, sending its request early if possible, and return its exit code."""
+    """Run a parsed command, and return its exit code."""
     started_at = time.monotonic()
     command, given = plain.command.name, plain.given
     blocked: set[int] = set()
@@ -158,7 +158,9 @@ def may_send_early(plain: PlainCommand) -> bool:
 
 
 def _connect_early(plain: PlainCommand, before_sending: Callable[[], None]) -> ConnectionAttempt | None:
-    """Connect to the server and, if possible, send the request, without waiting for a slow server.
+    """Connect to the server, and send the request if the server answers soon.
+
+    Return the attempt.
 
     Args:
         plain: the command.
@@ -176,7 +178,7 @@ def _connect_early(plain: PlainCommand, before_sending: Callable[[], None]) -> C
 
 
 def early_messages(plain: PlainCommand) -> tuple[JsonObject, JsonObject] | None:
-    """Return a command's hello and request messages, or None if the client library has to send them."""
+    """Return a command's hello and request messages if they can be sent early."""
     command, name = plain.command, sender_name(plain.given.get("name"))
     request = _early_request(command.name, plain.given)
     if request is None or len(name or "") > MAX_SENDER_NAME_CHARS:
@@ -185,7 +187,7 @@ def early_messages(plain: PlainCommand) -> tuple[JsonObject, JsonObject] | None:
 
 
 def _early_request(command: str, given: dict[str, Any]) -> JsonObject | None:
-    """Return the request message of a command, or None if the client library has to build it."""
+    """Return a command's request message if it is simple enough to send early."""
     from talkcli.protocol.lines import write_request
 
     if command == "say":
@@ -193,7 +195,7 @@ def _early_request(command: str, given: dict[str, Any]) -> JsonObject | None:
         return write_request(say) if say else None
     if command == "cancel":
         ids, before, key = given["ids"], given["before"], given["key"]
-        # Leave several ids to the library. They may contain duplicates or be too many for one request.
+        # Let the library handle several ids, because there may be duplicates or too many for one request.
         if len(ids) > 1 or not all(map(_is_full_id, [*ids, before or "-"])) or (key and check_key(key)):
             return None
         return write_request(Cancel(ids or None, given["current"], before, key))
@@ -204,7 +206,7 @@ def _early_request(command: str, given: dict[str, Any]) -> JsonObject | None:
 
 
 def _is_full_id(goal_id: str) -> bool:
-    """Return whether a goal id is complete and short enough, so that it can be sent unchanged.
+    """Return whether a goal id is complete and can be sent unchanged.
 
     A number such as 12 isn't complete, because the library has to add the server's boot id.
     """
@@ -212,7 +214,7 @@ def _is_full_id(goal_id: str) -> bool:
 
 
 def _say_request(given: dict[str, Any]) -> Say | None:
-    """Return the request to say a text, or None if the text contains invalid UTF-8 or may be too long."""
+    """Return the request to say a text, if the text is valid and short enough."""
     options = {each.name: given[each.name] for each in Say.options if each.name in given}
     say = Say(**{**options, "text": " ".join(given["text"]), "wait": given["wait"] or given["feedback"]})
     try:

@@ -40,7 +40,9 @@ def say(
     output: str | None,
     **goal_options: Any,
 ) -> int:
-    """Speak a text or the lines of standard input, or write the speech to a file. Return the exit code.
+    """Speak a text or standard input, or write the speech to a file.
+
+    Return the exit code.
 
     Args:
         options: the options of every command.
@@ -110,7 +112,10 @@ def _read_input(
 
 
 def replace_and_report_bad_bytes(text: str, options: CommonOptions) -> str:
-    """Return a text with invalid UTF-8 replaced, and print a message about that unless --quiet is given."""
+    """Replace invalid UTF-8 in a text.
+
+    Print a message about the change unless --quiet is given.
+    """
     text, problem = replace_bad_bytes(text)
     if problem and not options.quiet:
         note(problem)
@@ -132,7 +137,10 @@ def _report_sent(goal: GoalHandle, options: CommonOptions, reporter: GoalReporte
 def _write_file(
     path: str, text: str, goal_options: Mapping[str, Any], timeout: float | None, options: CommonOptions
 ) -> int:
-    """Write the speech to a file, or to standard output if the path is "-". Return the exit code."""
+    """Write the speech to a file, or to standard output if the path is "-".
+
+    Return the exit code.
+    """
     from talkcli.engine.parent.render import STANDARD_OUTPUT, render
 
     settings, seconds_at_most = _sound_settings(goal_options), seconds_left(options.deadline(timeout))
@@ -155,7 +163,7 @@ def _write_file(
 
 
 def _sound_settings(goal_options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the engine's settings, by name, from the options or else from environment variables."""
+    """Return the engine's settings from options and environment variables."""
     found = {}
     for option in SOUND_OPTIONS:
         value, text = goal_options[option.name], os.environ.get(option.env) if option.env else None

@@ -1,4 +1,4 @@
-"""The commands `talk serve` and `talk bridge`, which run until they are stopped, and their systemd units.
+"""The commands `talk serve` and `talk bridge`, and their systemd units.
 
 The templates of the units are in the directory `systemd`. For example, `serve-user` is the template for `talk serve
 --print-unit user`. A name in braces is replaced by its value, and a line such as `@supervision.conf` includes that
@@ -47,7 +47,7 @@ _HOME_DIRECTORIES = ("/home/", "/root/", "/run/user/")
 
 
 def serve(options: CommonOptions, print_unit: str | None, **given: Any) -> int:
-    """Run the server or print a systemd unit for it, and return the exit code.
+    """Run the server, or print a systemd unit for it.
 
     `given` contains all other options, by name.
     """
@@ -72,7 +72,7 @@ def _warn_about_sound(player: str, driver: str | None) -> None:
     from talkcli.engine.voices import is_own_driver
 
     if is_silent(player) or not is_own_driver(driver):
-        return  # other drivers play sound themselves, and the server reports this
+        return  # the server reports sound problems of other drivers
     if (not player or player in PACKAGES) and has_no_output(os.environ):
         note(_NO_DEVICE)
     if not player or (player in PLAYERS and player not in PACKAGES):
@@ -86,7 +86,10 @@ def _warn_about_sound(player: str, driver: str | None) -> None:
 
 
 def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **given: Any) -> int:
-    """Run the bridge, or print its systemd unit or the broker's access rules. Return the exit code."""
+    """Run the bridge, or print its systemd unit or the broker's access rules.
+
+    Return the exit code.
+    """
     from talkcli.fleet import topics
     from talkcli.fleet.bridge.policy import ALLOWABLE_REQUESTS
 
@@ -107,7 +110,7 @@ def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **gi
     if print_unit:
         words = ["--insecure"] if options.insecure else []
         return _print_unit(options, "bridge", print_unit, given, words, environment=_BRIDGE_ENVIRONMENTS[print_unit])
-    options.broker()  # check the settings, and whether the package for the next import is installed
+    options.broker()  # check the settings and the package that the next import needs
     from talkcli.fleet.bridge.main import BridgeSettings, run_bridge
 
     settings = BridgeSettings(
@@ -125,7 +128,9 @@ def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **gi
 def _print_unit(
     options: CommonOptions, command: str, kind: str, given: Mapping[str, Any], arguments: Sequence[str], **values: str
 ) -> int:
-    """Print a systemd unit, and warn if the service's user can't access the program. Return the exit code.
+    """Print a systemd unit, and warn if the service's user can't access the program.
+
+    Return the exit code.
 
     Args:
         options: the common options, with the socket and the names of the options to copy into the unit.
@@ -157,9 +162,9 @@ def _print_unit(
     if hidden:
         file, directory = hidden
         note(
-            f"the service's user can't enter {printable(directory)}, but this talk needs {printable(file)}; install "
+            f"talk needs {printable(file)}, but the service's user can't enter {printable(directory)}; install "
             "talk for all users with 'sudo /usr/bin/python3 -m venv /opt/talk && sudo /opt/talk/bin/pip install .' in "
-            "a checkout, and print the unit with that talk"
+            "a checkout, and print the unit with /opt/talk/bin/talk"
         )
     return EXIT_OK
 
@@ -171,7 +176,7 @@ def _read_template(name: str) -> str:
 
 
 def _find_program(started_as: str) -> tuple[str, ...]:
-    """Return the command that starts this program: the installed script or `python -m talkcli`."""
+    """Return the command that starts this program."""
     script = os.path.join(os.path.dirname(sys.executable), "talk")
     found = shutil.which(started_as if os.path.basename(started_as) == "talk" else script)
     return (os.path.abspath(found),) if found else (sys.executable, "-m", "talkcli")
@@ -185,7 +190,7 @@ def _format_option(option: Option, value: object) -> str:
 
 
 def _find_inaccessible(files: Sequence[str]) -> tuple[str, str] | None:
-    """Return the first file that other users can't reach and the directory that blocks them, or None."""
+    """Find a file that other users can't reach, and the directory that blocks them."""
     for path in files:
         steps = path.split(os.sep)
         for count in range(2, len(steps)):
@@ -210,7 +215,7 @@ def _escape_match(found: re.Match[str]) -> str:
 
 
 def _escape_path(path: str) -> str:
-    """Escape a path for a setting in a unit, or raise UsageError if systemd would misread the path."""
+    """Escape a path for a setting in a systemd unit."""
     if re.search(_UNSAFE_CHARACTERS, path) or path.endswith(("\\", " ")):
         raise UsageError(
             f"a socket unit can't contain the path {printable(path)}; choose one without control characters"

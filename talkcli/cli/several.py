@@ -44,7 +44,7 @@ def say(
     name: str | None,
     **chosen: Any,
 ) -> int:
-    """Send a text to each selected robot, print the outcomes, and return the exit code.
+    """Send a text to each selected robot, and print the outcomes.
 
     The arguments are explained in `say.say`.
     """
@@ -62,40 +62,51 @@ def say(
 
 
 def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None) -> int:
-    """Wait on each robot until the given goals, or all goals, have ended. Return the exit code."""
+    """Wait on each robot until the given goals, or all goals, have ended.
+
+    Return the exit code.
+    """
     discard_unread_output()
     return _send_request(options, Wait(ids or None), timeout)
 
 
 def cancel(options: CommonOptions, ids: tuple[str, ...], current: bool, before: str | None, key: str | None) -> int:
-    """Cancel the selected goals, or all goals, on each robot. Return the exit code."""
+    """Cancel the selected goals, or all goals, on each robot."""
     return _send_request(options, Cancel(ids or None, current, before, key))
 
 
 def status(options: CommonOptions, goal_id: str | None, long: bool) -> int:  # noqa: ARG001 - ids are always whole
-    """Show the status of each robot, or the state of one goal on each robot. Return the exit code."""
+    """Show the status of each robot, or the state of one goal on each robot.
+
+    Return the exit code.
+    """
     return _send_request(options, Status(goal_id))
 
 
 def change(options: CommonOptions, **settings: Any) -> int:
-    """Change the given settings on each robot, or show all settings if none are given. Return the exit code."""
+    """Change the given settings on each robot, or show all settings if none are given.
+
+    Return the exit code.
+    """
     return _send_request(options, Set(**settings))
 
 
 def pause(options: CommonOptions) -> int:
-    """Pause speech on each robot, and return the exit code."""
+    """Pause speech on each robot."""
     return _send_request(options, Pause())
 
 
 def resume(options: CommonOptions) -> int:
-    """Resume paused speech on each robot, and return the exit code."""
+    """Resume paused speech on each robot."""
     return _send_request(options, Resume())
 
 
 def _send_request(
     options: CommonOptions, request: Request, timeout: float | None = None, name: str | None = None
 ) -> int:
-    """Send a request to the robots, print the outcomes, and return the exit code. Cancel its goals if interrupted.
+    """Send a request to the robots, and print the outcomes.
+
+    Cancel its goals if interrupted.
 
     Goals are only cancelled if the command waits for goals that it has sent itself. A timeout also interrupts the wait.
 
@@ -133,7 +144,7 @@ def _send_request(
 
 
 def _cancel_goals(fleet_request: FleetRequest, interrupts: Interrupts, printer: _OutcomePrinter) -> None:
-    """Cancel the unfinished goals of a request, and print the outcomes that arrive within a second."""
+    """Cancel a request's unfinished goals, and wait briefly for the outcomes."""
     interrupts.prepare_cleanup()
     try:
         if fleet_request.unfinished_robots:
@@ -150,14 +161,13 @@ class _OutcomePrinter:
 
     def __init__(self, options: CommonOptions, request: Request) -> None:
         self._options, self._request = options, request
-        #: each robot's first failure, or its latest outcome if it hasn't failed; `last` is taken from the latest
-        #: outcome
+        #: each robot's first failure or, if there is none, its latest outcome. `last` always has its latest value.
         self._outcomes: dict[str, Outcome] = {}
         shows_count = not options.quiet and sys.stderr is not None and sys.stderr.isatty()
         self._terminal = sys.stderr if shows_count else None
 
     def show_outcomes(self, fleet_request: FleetRequest, timeout: float | None) -> None:
-        """Record and print each outcome as it arrives, and keep the number of finished robots on the screen.
+        """Record and print each outcome as it arrives.
 
         This raises the same errors as `FleetRequest.results`.
         """
@@ -172,15 +182,20 @@ class _OutcomePrinter:
             self._clear_count()
 
     def _record(self, outcome: Outcome) -> None:
-        """Record an outcome. A robot's earlier failure is kept, unless it seemed to be the final outcome."""
+        """Store a robot's latest outcome.
+
+        An earlier failure is only replaced if it seemed to be final.
+        """
         before = self._outcomes.get(outcome.robot)
-        # If a robot answers after a failure that seemed final, it only appeared to be absent. Replace the failure.
+        # A robot that answers after such a failure only appeared to be absent, so replace the failure.
         if before is not None and before.exit_code and not before.last:
             outcome = replace(before, last=outcome.last)
         self._outcomes[outcome.robot] = outcome
 
     def summarize(self, fleet_request: FleetRequest, unfinished_label: str = "not done") -> int:
-        """Print how many robots succeeded and why others failed, unless --quiet is given. Return the exit code.
+        """Print how many robots succeeded, and why the others failed.
+
+        Return the exit code.
 
         Args:
             fleet_request: the request.
@@ -199,7 +214,10 @@ class _OutcomePrinter:
         return EXIT_DIFFER if len(codes) > 1 else next(iter(codes), EXIT_OK)
 
     def _print_outcome(self, outcome: Outcome) -> None:
-        """Print an outcome as JSON, as settings or as a line. With --quiet, leave out the line, except for `status`."""
+        """Print an outcome as JSON, as settings or as a line.
+
+        With --quiet, leave out the line, except for `status`.
+        """
         if self._options.json:
             show_if_possible(show_json, outcome.to_json())
         elif outcome.said and self._request == Set():
@@ -211,21 +229,21 @@ class _OutcomePrinter:
             show_if_possible(show, f"{outcome.robot} {goal} {outcome.state} {outcome.exit_code}")
 
     def _show_count(self, fleet_request: FleetRequest) -> None:
-        """Show the number of finished robots if standard error is a terminal and --quiet isn't given."""
+        """Show the number of finished robots on the terminal."""
         if self._terminal:
             finished = sum(each.last for each in self._outcomes.values())
             self._terminal.write(f"\r{finished} of {len(fleet_request)} robots")
             self._terminal.flush()
 
     def _clear_count(self) -> None:
-        """Remove the number of finished robots from the terminal."""
+        """Clear the number of finished robots from the terminal."""
         if self._terminal:
             self._terminal.write("\r\x1b[2K")
             self._terminal.flush()
 
 
 def _failure_notes(failures: list[Outcome]) -> list[str]:
-    """Return one message for each kind of failure, with the robots' names and the first robot's reason."""
+    """Return a message for each kind of failure, with the robots' names."""
     alike: dict[tuple[str, int], list[Outcome]] = {}
     for each in failures:
         alike.setdefault((each.state, each.exit_code), []).append(each)
@@ -236,7 +254,7 @@ def _failure_notes(failures: list[Outcome]) -> list[str]:
 
 
 def _join_names(names: list[str]) -> str:
-    """Join the first few names, and append the number of remaining names."""
+    """Join the first few names, and append the number of others."""
     more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
     return ", ".join(names[:_MAX_NAMES]) + more
 

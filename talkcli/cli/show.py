@@ -42,7 +42,7 @@ _NO_BREAK_SPACE = "\0"
 
 
 class CommonOptions:
-    """The options common to all commands, and the connection to the server if it is already open."""
+    """The options common to all commands."""
 
     socket: str | None = None
     robot: str | None = None
@@ -50,7 +50,7 @@ class CommonOptions:
     json = False
     quiet = False
     connect_timeout: float | None = None
-    #: the connection that `plain` has opened, or None; the request may already have been sent
+    #: the connection, if `plain` has opened one. The request may already have been sent.
     early: ConnectionAttempt | None = None
     #: signals that stay blocked until the command can handle them
     blocked_signals: Iterable[int] = ()
@@ -65,11 +65,16 @@ class CommonOptions:
         vars(self).update(given)
 
     def deadline(self, timeout: float | None) -> float | None:
-        """Convert a timeout, counted from the start of the command, to a monotonic time. None means no limit."""
+        """Convert a timeout to a deadline, counted from the start of the command.
+
+        None means no limit.
+        """
         return None if timeout is None else self.started_at + timeout
 
     def connect(self, timeout: float | None = None, **options: Any) -> Client:
-        """Return a client connected to the server or the robot. Retry as long as --connect-timeout allows.
+        """Return a client connected to the server or the robot.
+
+        Retry as long as --connect-timeout allows.
 
         The first call keeps trying for `connect_timeout` seconds.
 
@@ -112,7 +117,7 @@ class CommonOptions:
         return from_environment(os.environ, insecure=self.insecure)
 
     def _open_connection(self, **options: Any) -> Connection:
-        """Open a connection to the robot, or to the server of this machine if no robot is selected."""
+        """Connect to the selected robot, or to the server on this machine."""
         robot = paths.named_robot(self.robot, self.socket)
         if not robot:
             from talkcli.client.connection import SocketConnection
@@ -125,7 +130,7 @@ class CommonOptions:
 
 
 def run_command(command: Callable[[], object], options: CommonOptions) -> int:
-    """Run a command, report its errors on standard error, and return its exit code.
+    """Run a command, report its errors, and return its exit code.
 
     If the command returns a number, that is its exit code. Any other value means success.
     """
@@ -177,7 +182,9 @@ def reader_is_gone(error: OSError) -> bool:
 
 
 def handle_output_error(error: Exception) -> int | None:
-    """Discard further output after an output error, and return its exit code. Return None for other errors.
+    """Discard further output after an output error, and return its exit code.
+
+    Return None for other errors.
 
     A full or broken disk is reported.
 
@@ -208,7 +215,9 @@ def _is_read_only(error: OSError) -> bool:
 
 
 def show_if_possible(write: Callable[..., None], *given: object) -> None:
-    """Call a function that writes output. If the disk is full or broken, report this and continue.
+    """Call a function that writes output.
+
+    If the disk is full or broken, report this and continue.
 
     Raises:
         OSError: the reader of the output is gone.
@@ -221,7 +230,10 @@ def show_if_possible(write: Callable[..., None], *given: object) -> None:
 
 
 def retry_without_output(write: Callable[..., _T], *given: Any) -> _T:
-    """Call a function and return its result. If nothing reads its output, discard all output and call it again."""
+    """Call a function and return its result.
+
+    If nothing reads its output, discard all output and call it again.
+    """
     try:
         return write(*given)
     except OSError as error:
@@ -261,7 +273,10 @@ def show_json(message: JsonObject) -> None:
 
 
 def show_result(options: CommonOptions, items: Iterable[JsonObject], lines: Callable[[], Iterable[str]]) -> None:
-    """Print `items` as JSON objects with --json, otherwise the lines of text that `lines` returns."""
+    """With --json, print `items` as JSON objects.
+
+    Otherwise, print the lines that `lines` returns.
+    """
     if options.json:
         for item in items:
             show_json(item)
@@ -271,7 +286,10 @@ def show_result(options: CommonOptions, items: Iterable[JsonObject], lines: Call
 
 
 def _write_json(stream: TextIO, message: JsonObject) -> None:
-    """Write an object to a stream as one line of JSON. On a terminal, escape invisible characters."""
+    """Write an object to a stream as one line of JSON.
+
+    On a terminal, escape invisible characters.
+    """
     from talkcli.protocol.lines import encode  # imported late, because help and completion don't need JSON
 
     line = encode(message)
@@ -285,7 +303,10 @@ def _write_json(stream: TextIO, message: JsonObject) -> None:
 
 
 def note(message: str) -> None:
-    """Write a message to standard error, starting with `talk:`. On a terminal, wrap long lines."""
+    """Write a message to standard error, starting with `talk:`.
+
+    On a terminal, wrap long lines.
+    """
     lines = f"talk: {message}"
     if sys.stderr is not None and sys.stderr.isatty():
         lines = _wrap(lines)
@@ -293,7 +314,10 @@ def note(message: str) -> None:
 
 
 def write_error_line(line: str = "") -> None:
-    """Write a line to standard error if it is open. If this fails, discard all further messages."""
+    """Write a line to standard error if it is open.
+
+    If this fails, discard all further messages.
+    """
     if sys.stderr is not None:
         # The command must continue even if nothing reads its messages.
         try:
@@ -304,7 +328,10 @@ def write_error_line(line: str = "") -> None:
 
 
 def terminal_columns(stream: TextIO) -> int:
-    """Return the width of a terminal. If the terminal doesn't report it, return COLUMNS or 80."""
+    """Return the width of a terminal.
+
+    If the terminal doesn't report it, return COLUMNS or 80.
+    """
     try:
         columns = os.get_terminal_size(stream.fileno()).columns
     except OSError:
@@ -315,7 +342,7 @@ def terminal_columns(stream: TextIO) -> int:
 
 
 def _wrap(text: str) -> str:
-    """Wrap a message to the width of the terminal at standard error, without breaking commands in it."""
+    """Wrap a message to the width of the terminal, without breaking commands."""
     columns = terminal_columns(sys.stderr)
     if all(len(line) <= columns for line in text.split("\n")):
         return text
@@ -361,7 +388,10 @@ class Feedback:
         note(message)
 
     def close(self) -> None:
-        """Finish the display before other output is written. In the base class, there is nothing to do."""
+        """Finish the display before other output is written.
+
+        In the base class, there is nothing to do.
+        """
 
 
 def has_colour() -> bool:
@@ -370,7 +400,7 @@ def has_colour() -> bool:
 
 
 def screen(*, long: bool = False, boot: str = "") -> Screen:
-    """Return a Screen, which describes the width and colours of standard output and how much detail to show."""
+    """Return the properties of standard output as a Screen."""
     from talkcli.terminal.text import Screen
 
     if sys.stdout is None or not sys.stdout.isatty():

@@ -54,11 +54,11 @@ _NO_LIMIT = float("inf")
 
 
 class InputTooLong(UsageError):
-    """Raised if standard input exceeds the maximum length of a text."""
+    """Raised if standard input is longer than a text may be."""
 
 
 def read_text(end: float | None, *, stop_without_reader: bool = False, any_length: bool = False) -> str | int:
-    """Read standard input as one text. Return it, or the exit code if a signal or closed output ends the reading.
+    """Return all of standard input as one text, or an exit code if interrupted.
 
     Args:
         end: the monotonic time by which the input must have ended, or None for no limit.
@@ -100,7 +100,7 @@ class InputLine:
     """A line of standard input."""
 
     number: int
-    #: the line without its line ending; truncated if the line is too long
+    #: the line without its line ending, cut off if it is too long
     text: str
     #: the size of the line in bytes if it is too long to be spoken, otherwise 0
     oversize_bytes: int = 0
@@ -120,7 +120,7 @@ class LineBuffer:
         self._ttl = ttl
         # Allow one more byte than the longest text has, because a line may end in CRLF.
         self._splitter = LineSplitter(MAX_TEXT_BYTES + 1)
-        #: unsplit chunks of input and the times at which they were read; splitting them late saves memory
+        #: chunks of input with the times at which they were read. Splitting them into lines late saves memory.
         self._chunks: deque[tuple[float, bytes]] = deque()
         self._lines: deque[InputLine] = deque()
         self._number = 0
@@ -136,7 +136,7 @@ class LineBuffer:
 
     @property
     def first(self) -> InputLine | None:
-        """The oldest line that isn't blank, or None if the buffer contains no such line."""
+        """The oldest line that isn't blank."""
         while not self._lines and self._chunks:
             now, data = self._chunks.popleft()
             self.size -= len(data)
@@ -153,7 +153,10 @@ class LineBuffer:
         return self._lines.popleft()
 
     def take_expired(self, now: float) -> Iterator[InputLine]:
-        """Remove and yield expired lines, at most 1,000 at once so that the caller can check for signals."""
+        """Remove and yield expired lines.
+
+        A call yields at most 1,000, so that the caller can check for signals.
+        """
         for _ in range(_MAX_EXPIRED_LINES):
             if not self.first or self.first.end > now:
                 break
@@ -161,7 +164,10 @@ class LineBuffer:
 
 
 def _read_available() -> bytes | None:
-    """Read from standard input, and return the data, b"" at its end, or None if no input is available yet."""
+    """Return data from standard input.
+
+    It is b"" at the end of the input, and None if reading would block.
+    """
     try:
         return os.read(0, _STDIN_READ_BYTES)
     except BlockingIOError:  # another program has made standard input non-blocking
@@ -171,13 +177,13 @@ def _read_available() -> bytes | None:
 
 
 def _decode_text(data: bytes) -> str:
-    """Decode UTF-8, with surrogates for invalid bytes, and remove line breaks at the end."""
+    """Decode UTF-8, and remove line breaks at the end."""
     # Invalid bytes are decoded to surrogates, which `replace_bad_bytes` replaces later.
     return data.decode(errors="surrogateescape").rstrip("\r\n")
 
 
 class InputSpeaker:
-    """A base class for the commands that speak standard input while it arrives."""
+    """Base class for the commands that speak standard input while it arrives."""
 
     def __init__(
         self,
@@ -205,7 +211,10 @@ class InputSpeaker:
         self._interrupts = Interrupts(output=wait)
 
     def run(self) -> int:
-        """Connect, send the input and, with --wait, wait until all goals have ended. Return the exit code."""
+        """Connect, send the input, and wait for the goals if requested.
+
+        Return the exit code.
+        """
         options, interrupts = self._options, self._interrupts
         try:
             with interrupts, options.connect(self._timeout, name=self._name, interrupt=interrupts.watched) as client:
@@ -220,14 +229,24 @@ class InputSpeaker:
         return interrupts.exit_code
 
     def _run_connected(self) -> int:
-        """Send the input and follow the goals until done. Return the exit code."""
+        """Send the input and follow the goals until done.
+
+        Return the exit code.
+        """
         raise NotImplementedError
 
     def _await_input(self, wait: Callable[[], object], *, wants_input: bool) -> bytes | None:
-        """Call a function that waits until it is interrupted, and return the input that has interrupted it, or None.
+        """Call a function that waits, and return the input that interrupts it.
+
+        Args:
+            wait: the function.
+            wants_input: whether input interrupts the function.
+
+        Returns:
+            the input, which is b"" at its end. None if there was none.
 
         Raises:
-            Interrupted: a signal or closed output has interrupted it.
+            Interrupted: a signal or closed output has interrupted the function.
         """
         watched = self._interrupts.watched
         if wants_input:
@@ -245,7 +264,7 @@ class InputSpeaker:
 
 
 class LineSpeaker(InputSpeaker):
-    """Speaks the lines of standard input for `say --lines`, each line as a goal."""
+    """Speaks each line of standard input as a goal, for `say --lines`."""
 
     def __init__(self, *given: Any, ahead: int | None) -> None:
         """Initialise the speaker without connecting to the server.
@@ -258,12 +277,11 @@ class LineSpeaker(InputSpeaker):
         self._max_pending = ahead or _DEFAULT_PENDING_GOALS
         self._ttl: float | None = self._goal_options["ttl"] or None
         self._buffer = LineBuffer(self._ttl)
-        #: the number of the line that was sent but hasn't been accepted or rejected yet, or None
+        #: the number of the line that is waiting for the server's answer, or None
         self._sending: int | None = None
         #: the goal and its unanswered request, or None
         self._unanswered: tuple[GoalHandle, Exchange] | None = None
-        #: unfinished goals with their line numbers, in the order of the lines; with --wait, also ended goals that
-        #: haven't been reported yet
+        #: goals that haven't ended (or, with --wait, haven't been reported), with their line numbers
         self._goals: deque[tuple[int, GoalHandle]] = deque()
         #: whether the user has been told that speech is paused
         self._pause_known = False
@@ -273,7 +291,10 @@ class LineSpeaker(InputSpeaker):
         self._failure: tuple[int, int] | None = None
 
     def _run_connected(self) -> int:
-        """Send all lines and follow their goals until done or interrupted. Report errors, and return the exit code."""
+        """Send all lines and follow their goals until done or interrupted.
+
+        Report errors, and return the exit code.
+        """
         try:
             while not self._done:
                 try:
@@ -308,7 +329,7 @@ class LineSpeaker(InputSpeaker):
 
     @property
     def _has_lines(self) -> bool:
-        """Whether there are more lines to send or more input to expect."""
+        """Whether more lines may have to be sent."""
         return self._buffer.first is not None or not self._buffer.ended
 
     @property
@@ -332,7 +353,7 @@ class LineSpeaker(InputSpeaker):
         return not (self._buffer.first or self._unanswered or self._full)
 
     def _step(self) -> None:
-        """Drop expired lines, send as many lines as possible, and process the next input, answer or event.
+        """Send as many lines as possible, and process the next input or message.
 
         Raises:
             TimeoutError: the time limit of the command is over.
@@ -357,7 +378,10 @@ class LineSpeaker(InputSpeaker):
     # Sending lines
 
     def _send_line(self, line: InputLine) -> None:
-        """Send a line as a goal, without waiting for the answer. Report a line that is too long as rejected."""
+        """Send a line as a goal, without waiting for the answer.
+
+        Report a line that is too long as rejected.
+        """
         if line.oversize_bytes:
             words = f"the line has {line.oversize_bytes:,} bytes, but at most {MAX_TEXT_BYTES:,} are allowed"
             self._report_rejected(line.number, rejected_goal(words))
@@ -378,7 +402,10 @@ class LineSpeaker(InputSpeaker):
         self._unanswered = handle, self._connection.begin(request, accepted)
 
     def _process_answer(self) -> None:
-        """If the last line has been answered, report its goal as accepted or rejected, and follow an accepted one."""
+        """Process the server's answer to the last line, if it has arrived.
+
+        Follow an accepted goal.
+        """
         if self._unanswered is None or not self._unanswered[1].over:
             return
         (handle, exchange), number = self._unanswered, self._sending or 0
@@ -390,19 +417,22 @@ class LineSpeaker(InputSpeaker):
         self._sending = None
         self._call_writer(self._reporter.show_accepted, handle, self._pause_known)
         self._pause_known = handle.speech_paused
-        if not self._wait:  # report the state in the reply, because the goal may have ended since then
+        if not self._wait:  # report the state from the reply, because the goal may have ended in the meantime
             self._call_writer(self._reporter.report, Goal.from_json(reply.get("goal")))
         elif not self._goals:
             self._feedback.begin([handle.goal])
         self._goals.append((number, handle))
 
     def _report_rejected(self, number: int, goal: Goal) -> None:
-        """Report a rejected line, and record its exit code as a failure."""
+        """Report a rejected line, and record the failure."""
         self._sending = None
         self._record_failure(number, self._call_writer(self._reporter.report_refused, goal, f"line {number}: "))
 
     def _report_expired(self, line: InputLine) -> None:
-        """Report a line that expired before it was sent. With --wait, also record this as a failure."""
+        """Report a line that expired before it was sent.
+
+        With --wait, also record this as a failure.
+        """
         words = f"line {line.number} was not sent: its ttl of {format_number(self._ttl)} s is over"
         goal = Goal("", State.RECALLED, text=line.text, reason="expired", message=words)
         code = self._call_writer(self._reporter.report_refused, goal)
@@ -410,18 +440,21 @@ class LineSpeaker(InputSpeaker):
             self._record_failure(line.number, code)
 
     def _record_failure(self, number: int, code: int) -> None:
-        """Record an exit code, unless it is 0 or an earlier line has failed."""
+        """Record a line's exit code if it is the first failure."""
         if code and (self._failure is None or number < self._failure[0]):
             self._failure = number, code
 
     def _call_writer(self, write: Callable[..., _T], *given: object) -> _T:
-        """Call a function that writes output, and return its result. Without --wait, ignore a missing reader."""
+        """Call a function that writes output, and return its result.
+
+        Without --wait, ignore a missing reader.
+        """
         return write(*given) if self._wait else retry_without_output(write, *given)
 
     # Waiting for input and for the server
 
     def _wait_for_news(self) -> None:
-        """Wait for input, an answer or an event, until a line expires or time is up. Add any input to the buffer."""
+        """Wait for input or a message from the server, until the next deadline."""
         first = self._buffer.first
         end = min(first.end, self._end) if first and self._error is None else self._end
         was_full = self._full
@@ -446,7 +479,10 @@ class LineSpeaker(InputSpeaker):
                 wait(time.monotonic(), interruptible=False)
 
     def _report_goals(self) -> None:
-        """Forget goals that have ended. With --wait, first report their events in the order of the lines."""
+        """Forget goals that have ended.
+
+        With --wait, first report their events in the order of the lines.
+        """
         if not self._wait:
             self._goals = deque(each for each in self._goals if not each[1].state.terminal)
             return
@@ -464,7 +500,7 @@ class LineSpeaker(InputSpeaker):
     # Stopping before the end of the input
 
     def _stop_early(self) -> None:
-        """With --wait, cancel all goals. Then report the first line that wasn't sent."""
+        """Cancel the goals with --wait, and report the first unsent line."""
         if self._wait:
             # Close the connection first. Otherwise, a line that is waiting for room in the queue would be accepted when
             # the other goals are cancelled.
@@ -474,7 +510,7 @@ class LineSpeaker(InputSpeaker):
         self._report_unsent()
 
     def _cancel_goals(self, ids: list[str]) -> None:
-        """Cancel these and all other goals of this process, and report how they ended."""
+        """Cancel all goals of this process, and report how they ended."""
         self._options.urgent = True
         try:
             with self._options.connect(CANCEL_TIMEOUT_S, interrupt=self._interrupts.watched, end=None) as client:
@@ -495,7 +531,7 @@ class LineSpeaker(InputSpeaker):
             note(f"removed {recalled} waiting line{'s' * (recalled > 1)} from the queue")
 
     def _report_unsent(self) -> None:
-        """Print a message about the first line that wasn't sent or accepted, if any, unless --quiet is given."""
+        """Report the first line that wasn't sent or accepted, if any."""
         if self._options.quiet:
             return
         if self._sending is not None:

@@ -31,17 +31,20 @@ CANCEL_TIMEOUT_S = 1.0
 
 
 def seconds_left(end: float | None) -> float | None:
-    """Return the number of seconds until a monotonic time, at least 0, or None if there is no limit."""
+    """Return the number of seconds left until a deadline."""
     return None if end is None else max(0.0, end - time.monotonic())
 
 
 def timeout_error(timeout: float | None, details: str = "") -> TimedOut:
-    """Return the error to raise when --timeout has expired. `details` is added to its message."""
+    """Return the error to raise when --timeout has expired.
+
+    `details` is added to its message.
+    """
     return TimedOut(f"timed out after {format_number(timeout or 0)} s{details and f': {details}'}")
 
 
 class GoalReporter:
-    """Prints the ids, events and results of a command's goals, depending on the options."""
+    """Prints the ids, events and results of a command's goals."""
 
     def __init__(self, options: CommonOptions, *, feedback: bool) -> None:
         """Initialise the reporter. If `feedback` is true, it shows each event."""
@@ -65,7 +68,9 @@ class GoalReporter:
             self.feedback.note("speech is paused; continue with: talk resume")
 
     def follow(self, goals: Sequence[GoalHandle], timeout: float | None) -> None:
-        """Wait until these goals have ended, and show their events.
+        """Show the events of goals until they have ended.
+
+        Raise TimeoutError if they don't end in time.
 
         Raises:
             TimeoutError: the goals haven't ended in time.
@@ -87,7 +92,9 @@ class GoalReporter:
         return self.report(goal, prefix)
 
     def report(self, goal: Goal, prefix: str = "") -> int:
-        """With --json, print a goal. If it failed, print why. Return its exit code, or 124 if it is unfinished.
+        """With --json, print a goal.
+
+        If it failed, print why. Return its exit code, or 124 if it is unfinished.
 
         `prefix` is put in front of any message.
         """
@@ -126,10 +133,19 @@ class GoalReporter:
         retry_without_output(self.report, goal.goal)
 
     def wait_for(self, goal: GoalHandle, interrupts: Interrupts, timeout: float | None, follow: Follow) -> int:
-        """Wait until a goal has ended, or cancel it if interrupted or late. Report the end, and return the exit code.
+        """Wait until a goal has ended, report it, and return the exit code.
 
-        The goal is cancelled if the wait is interrupted or times out. However, if an earlier command has already sent a
-        goal with the same id, that goal isn't cancelled. `follow` waits, and shows the goal's events.
+        Cancel it on an interrupt or timeout. If an earlier command has already sent a goal with the same id, that goal
+        isn't cancelled.
+
+        Args:
+            goal: the goal.
+            interrupts: the signals that interrupt the wait.
+            timeout: the time limit of the command in seconds, for the error message.
+            follow: waits for the goal, and shows its events.
+
+        Raises:
+            TimedOut: the goal hasn't succeeded in time.
         """
         try:
             self.show_accepted(goal)
@@ -150,7 +166,10 @@ class GoalReporter:
 
 
 def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None, feedback: bool) -> int:
-    """Wait until the given goals, or all unfinished goals, have ended. Report failures, and return the exit code."""
+    """Wait until the given goals, or all unfinished goals, have ended.
+
+    Report failures, and return the exit code.
+    """
     end = options.deadline(timeout)
     discard_unread_output()
     with Interrupts(output=True) as interrupts, options.connect(timeout, interrupt=interrupts.watched) as client:

@@ -41,8 +41,7 @@ __all__ = ["Client", "GoalHandle"]
 
 #: Number of bytes in a request that are reserved for everything except the list of ids.
 _REST_OF_LINE_BYTES = 4096
-#: The maximum sizes of a character in JSON: two bytes for an escaped ASCII character, such as a quote, and twelve bytes
-#: for any other character, which may be an escaped surrogate pair.
+#: The maximum size of an ASCII character, such as an escaped quote, and of any other character in JSON.
 _MAX_ASCII_BYTES, _MAX_CHARACTER_BYTES = 2, 12
 #: A `seq` with more digits than that of any real request.
 _LONG_SEQ = 10**15
@@ -133,7 +132,9 @@ class Client:
         patient: bool = False,
         block: bool = True,
     ) -> GoalHandle:
-        """Send a goal, and return its handle. With `block`, wait until the server has accepted or REJECTED it.
+        """Send a goal, and return its handle.
+
+        With `block`, wait until the server has accepted or REJECTED it.
 
         Args:
             text: the text to speak, up to 10,000 characters.
@@ -244,7 +245,7 @@ class Client:
         return SpeechStream(self._connection, say)
 
     def follow(self, ids: Iterable[str] | None = None, *, feedback: bool = False) -> list[GoalHandle]:
-        """Receive the events of goals that any client has sent, and return their handles.
+        """Receive the events of goals, and return their handles.
 
         Args:
             ids: ids of goals; None for all goals that have not ended.
@@ -274,7 +275,9 @@ class Client:
         before: str | None = None,
         key: str | None = None,
     ) -> Canceled:
-        """Cancel goals, and return them when they are silent. Without arguments, cancel all goals.
+        """Cancel goals, and return them once they are silent.
+
+        Without arguments, cancel all goals.
 
         A goal is cancelled if any of the arguments selects it.
 
@@ -311,7 +314,7 @@ class Client:
         return ServerStatus.from_reply(*self._connection.request(Status()))
 
     def goal(self, goal_id: str) -> Goal:
-        """Return the current state of a goal.
+        """Return a goal in its current state, or raise UnknownGoal.
 
         Raises:
             UsageError: the id is empty.
@@ -335,10 +338,11 @@ class Client:
         return list(goals(items, "goal"))
 
     def voices(self) -> list[JsonObject]:
-        """Return the voices of the server's engine, as objects with `id`, `language`, `name`, `quality` and `speakers`.
+        """Return the voices of the server's engine.
 
-        The quality of a neural voice is a word such as "medium". Its speakers are a list of names, or None if there is
-        only one speaker. Other voices have None for both.
+        Each voice has the fields `id`, `language`, `name`, `quality` and `speakers`. The quality of a neural voice is a
+        word such as "medium". Its speakers are a list of names, or None if there is only one speaker. Other voices have
+        None for both.
         """
         _, items = self._connection.request(Voices())
         return [each["voice"] for each in items if isinstance(each.get("voice"), dict)]  # type: ignore[misc]
@@ -384,14 +388,14 @@ class Client:
         return settings if isinstance(settings, dict) else {}
 
     def pause(self) -> Goal | None:
-        """Pause all speech, and return the paused goal when it is silent, or None if no goal was being spoken.
+        """Pause all speech, and return the paused goal, if any, once it is silent.
 
         Nothing is spoken until any client calls `resume`. Pausing twice is no error.
         """
         return goal_in(self._connection.request(Pause())[0])
 
     def resume(self) -> Goal | None:
-        """Resume speech, and return the resumed goal, or None if no goal was paused.
+        """Resume speech, and return the resumed goal, if any.
 
         Resuming twice is no error.
         """
@@ -424,9 +428,10 @@ class Client:
     # -- internal
 
     def _create_handle(self, request: Say) -> tuple[GoalHandle, OnReply]:
-        """Check a new goal, and return its handle and the function that processes the server's reply.
+        """Check a new goal, and create its handle.
 
-        If the text is too long for a request, the goal is already REJECTED.
+        Also return the function that processes the server's reply. If the text is too long for a request, the goal is
+        already REJECTED.
 
         Raises:
             UsageError: a value is out of its range.
@@ -442,14 +447,20 @@ class Client:
         return handle, accepted
 
     def _full_id(self, goal_id: str) -> str:
-        """Return an id, prefixed with the boot id if it is only a number. Raises the same errors as `check_id`."""
+        """Prefix an id with the boot id if it is only a number.
+
+        Raises the same errors as `check_id`.
+        """
         if goal_id.isascii() and goal_id.isdecimal():
             goal_id = f"{self._first_boot}-{goal_id}"
         check_id(goal_id)
         return goal_id
 
     def _take_all(self, buffer: EventBuffer) -> Iterator[Event]:
-        """Yield the events of a buffer as they arrive. Raises Lost when the buffer or the connection is closed."""
+        """Yield the events of a buffer as they arrive.
+
+        Raises Lost when the buffer or the connection is closed.
+        """
         for event in take_repeatedly(self._connection, lambda: buffer.take() or buffer.closed, None):
             if event is None or isinstance(event, str):
                 break
@@ -464,7 +475,7 @@ def _new_goal_id() -> str:
 
 
 def check_id(goal_id: str) -> None:
-    """Raise UsageError if an id is empty, or UnknownGoal if it is too long for any goal."""
+    """Raise an error if no goal can have this id."""
     if not goal_id:
         raise UsageError("the goal's id is empty; check the variable that should contain it")
     if len(goal_id) > MAX_ID_CHARS:
@@ -472,7 +483,7 @@ def check_id(goal_id: str) -> None:
 
 
 def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
-    """Split ids into groups, each of which fits into one request. Duplicates are removed."""
+    """Split ids into groups that fit into one request, without duplicates."""
     groups: list[list[str]] = []
     room = 0
     for each in dict.fromkeys(ids):
@@ -487,7 +498,7 @@ def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
 
 
 def check(request: Say | Set) -> None:
-    """Raise UsageError if an option of a request is invalid, using the same checks as the server."""
+    """Raise UsageError if an option of a request is invalid."""
     for option in request.options:
         try:
             fault = option.type_error(getattr(request, option.name))
@@ -500,7 +511,7 @@ def check(request: Say | Set) -> None:
 
 
 def too_long(request: Say) -> Goal | None:
-    """Return a REJECTED goal if the text is too long for a request, or None if it isn't.
+    """Return a REJECTED goal if the text is too long for a request.
 
     Raises:
         UsageError: `data` has no JSON form.

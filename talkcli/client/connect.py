@@ -28,20 +28,20 @@ if TYPE_CHECKING:
 
 #: The beginning of the greeting of a server with the same protocol. A test compares it with a real greeting.
 GREETING_START = b'{"talk": 1, "version": '
-#: An idle server sends its greeting within this time. Longer waits must be interruptible.
+#: How long to wait for the greeting of an idle server. Longer waits must be interruptible.
 GREETING_WAIT_S = 0.2
 #: Maximum time for which `yield_processor` waits.
 _LONGEST_YIELD_S = 0.2
 #: If an answer contains one of these, the goal will not be spoken.
 _REFUSALS = (b'"ok": false', b'"state": "REJECTED"')
-#: Time limit for a server's greeting, and for each answer. A busy server is tried again for as long.
+#: Time limit for a greeting, for each answer, and for attempts to reach a busy server.
 ANSWER_LIMIT_S = 5.0
 #: The minimum and maximum pause before trying again. The pause is random, so that refused clients don't all try again
 #: at the same moment.
 RETRY_PAUSE_S = (0.02, 0.2)
 #: Advice for users who can't connect to a server.
 _START_STEP = "start one with: talk serve"
-_LET_IN_STEP = "its owner can let you in with: talk serve --socket-mode 0660 (if you are in the socket's group)"
+_LET_IN_STEP = "ask its owner to run: talk serve --socket-mode 0660 (this admits the socket's group)"
 _START_OWN_STEP = "or start your own server with: talk serve"
 
 
@@ -61,7 +61,7 @@ class ConnectionAttempt:
     received: bytes = b""
     #: the part of the first request that has been sent
     request_sent: bytes = b""
-    #: the server's greeting, or None if it has not been read yet
+    #: the server's greeting, or None before it has been read
     server: ServerInfo | None = None
 
     @property
@@ -73,7 +73,7 @@ class ConnectionAttempt:
 def reach(
     named: str | None, failures: tuple[tuple[str, Exception], ...] = (), only: str | None = None
 ) -> ConnectionAttempt:
-    """Try to connect to the first usable socket, without sending anything, and return the attempt.
+    """Try to connect to the first usable socket, without sending anything.
 
     Args:
         named: path of the only socket to try, as the user named it; None for the usual places.
@@ -99,7 +99,7 @@ def reach(
 
 
 def _check_owner(connected: _socket.socket) -> None:
-    """Raise AccessDenied if the server belongs to another user, who could read all requests."""
+    """Raise AccessDenied if the server belongs to another user."""
     _, uid = peers.credentials(connected)
     if uid not in {os.getuid(), 0}:
         raise AccessDenied(f"belongs to uid {uid}; to use it anyway, add --socket")
@@ -108,7 +108,9 @@ def _check_owner(connected: _socket.socket) -> None:
 def send_early(
     attempt: ConnectionAttempt, hello: JsonObject, request: JsonObject, before: Callable[[], None]
 ) -> ConnectionAttempt | None:
-    """Send hello, and the first request if the greeting arrives soon. Return the new state, or None if disconnected.
+    """Send hello, and the first request if the greeting arrives soon.
+
+    Return the new state, or None if disconnected.
 
     The request is not sent if the greeting is late or unexpected, or if the server may lack a feature.
 
@@ -145,7 +147,9 @@ def send_early(
 
 
 def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> None:
-    """Sleep for a moment, so that the server can use the processor. Return early if the goal will not be spoken.
+    """Sleep for a moment, so that the server can use the processor.
+
+    Return early if the goal will not be spoken.
 
     A client that only waits for the end of its goal calls this before its other imports. The server, the engine, the
     player and the sound server need the processor until the first sound. Together they use about as much processor time
@@ -163,7 +167,7 @@ def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> None:
     connected.settimeout(pause)
     try:
         answer = connected.recv(65536, _socket.MSG_PEEK)
-    except OSError:  # there is no answer yet, or the connection broke, which the next read reports
+    except OSError:  # no answer has arrived; if the connection broke, the next read reports it
         answer = b""
     connected.setblocking(False)
     if answer and not any(each in answer for each in _REFUSALS):
@@ -171,7 +175,7 @@ def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> None:
 
 
 def sender_name(name: str | None) -> str | None:
-    """Return the given name, or else the value of TALK_NAME, or None if it isn't set."""
+    """Return the given name, or else the value of TALK_NAME."""
     # Cancelling must work even if the variable is not valid UTF-8.
     variable = os.environ.get("TALK_NAME", "").encode(errors="surrogateescape").decode(errors="replace")
     return name or variable or None
@@ -198,7 +202,9 @@ def connect(
     keep_trying: float = 0.0,
     end: float | None = None,
 ) -> ConnectionAttempt:
-    """Connect to the first usable server, trying again for a limited time, and read its greeting.
+    """Connect to the first usable server, and read its greeting.
+
+    Retry for a limited time.
 
     Args:
         named: path of the only socket to try; None for the usual places.
@@ -246,7 +252,7 @@ def connect(
 
 
 def _server_may_start(attempt: ConnectionAttempt) -> bool:
-    """Return whether a server could still be starting at one of the paths that could not be used."""
+    """Return whether a server may still be starting at one of the paths."""
     found = {paths.describe_place(path, error) for path, error in attempt.failures if isinstance(error, OSError)}
     return not found.isdisjoint({paths.PLACE_ABSENT, paths.PLACE_STALE})
 
@@ -254,7 +260,7 @@ def _server_may_start(attempt: ConnectionAttempt) -> bool:
 def _greet(
     attempt: ConnectionAttempt, hello: JsonObject, end: float, interrupt: Mapping[int, int] | None
 ) -> ConnectionAttempt:
-    """Send hello if it has not been sent yet, read the server's greeting, and return the updated attempt.
+    """Send hello if necessary, and read the server's greeting.
 
     The connection is closed if the greeting has not arrived by `end` (monotonic), and after any other error.
 
@@ -294,7 +300,7 @@ def _greet(
 
 
 def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
-    """Return an error that lists the sockets that could not be used and advises the user."""
+    """Return an error that lists the unusable sockets and gives advice."""
     if attempt.backlog_full:
         path = attempt.failures[-1][0]
         return ServerUnavailable(f"the server at {path} doesn't accept connections; restart it if it hangs")

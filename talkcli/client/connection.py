@@ -35,13 +35,16 @@ if TYPE_CHECKING:
 
 #: Maximum number of bytes to receive at once.
 _RECEIVE_BYTES = 256 * 1024
-#: The pause between two attempts to reconnect. A thread without a socket checks as often whether another thread has
-#: reconnected.
+#: The pause between two attempts to reconnect. A thread without a socket also checks at this interval whether
+#: another thread has reconnected.
 _RECONNECT_PAUSE_S = 0.1
 
 
 def checked_sender_name(name: str | None) -> str | None:
-    """Return the given name, or else TALK_NAME, or None. Raises UsageError if the name is too long."""
+    """Return the given name, or else the value of TALK_NAME.
+
+    Raises UsageError if the name is too long.
+    """
     name = sender_name(name)
     if name and len(name) > MAX_SENDER_NAME_CHARS:
         raise UsageError(f"the sender's name is too long: {len(name)} characters (at most {MAX_SENDER_NAME_CHARS})")
@@ -49,7 +52,9 @@ def checked_sender_name(name: str | None) -> str | None:
 
 
 def take_repeatedly(connection: Connection, take: Callable[[], _T], end: float | None) -> Iterator[_T]:
-    """Yield the results of `take` endlessly. Before each one, wait for the server until there is a result.
+    """Call `take` repeatedly, and yield its results.
+
+    While there is no result, wait for the server.
 
     An empty result is yielded if `end` has passed or the connection has ended. Nothing more is received after `end`, so
     that a loop over the results ends even if the server keeps sending events.
@@ -98,7 +103,10 @@ class Connection(ClientCore):
     exchange_type = Exchange
 
     def __init__(self, patience: float) -> None:
-        """Initialize a connection. The server must answer each request within `patience` seconds."""
+        """Initialize a connection.
+
+        The server must answer each request within `patience` seconds.
+        """
         super().__init__(patience, time.monotonic())
         #: protects all state, and is notified after messages have been processed
         self.changed = threading.Condition()
@@ -127,7 +135,7 @@ class Connection(ClientCore):
             self.changed.notify_all()
 
     def request(self, request: Request, on_reply: OnReply | None = None) -> tuple[JsonObject, list[JsonObject]]:
-        """Send a request, wait for the reply, and return it with its list items.
+        """Send a request, and return the reply with its list items.
 
         Args:
             request: the request.
@@ -153,7 +161,7 @@ class Connection(ClientCore):
         return self.answer(exchange)
 
     def begin(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> Exchange:
-        """Send a request, and return its exchange without waiting for the answer.
+        """Send a request without waiting for the answer.
 
         The arguments are those of `Exchange`.
         A caller without `on_failure` must call `forget` if it stops waiting for the answer.
@@ -170,7 +178,9 @@ class Connection(ClientCore):
         return exchange
 
     def submit(self, request: Request, on_reply: OnReply, on_failure: OnFailure) -> None:
-        """Send a request without blocking. Later calls send the bytes that the server doesn't accept now.
+        """Send a request without blocking.
+
+        Later calls send the bytes that the server doesn't accept now.
 
         One of the two functions is called during this call or a later one, while the lock `changed` is held.
 
@@ -196,7 +206,9 @@ class Connection(ClientCore):
         since: float | None = None,
         interruptible: bool = True,
     ) -> bool:
-        """Read and process messages until `done()` is true, the deadline passes, or the connection ends.
+        """Process messages until `done()` is true.
+
+        Return False if the deadline passes or the connection ends first.
 
         If the server is silent for too long, the connection ends.
 
@@ -250,12 +262,15 @@ class Connection(ClientCore):
                     self.changed.notify_all()
 
     def _read_available(self) -> None:
-        """Process the messages that have already arrived, and notice if the connection has ended."""
+        """Process all messages that have already arrived."""
         for _ in range(2):  # the end of the connection can only be read after the last messages
             self.wait_until(lambda: False, time.monotonic(), interruptible=False)
 
     def _cut_off(self) -> None:
-        """Break the connection, because a line could only be sent in part. The caller must hold the lock `changed`."""
+        """Break the connection after a line was sent only in part.
+
+        The caller must hold the lock `changed`.
+        """
         self.break_off(f"the server accepted no data for {self._patience:g} s", time.monotonic())
 
     # -- methods that each transport implements. Callers of `_send` and `_hang_up` hold the lock `changed`.
@@ -269,7 +284,9 @@ class Connection(ClientCore):
         raise NotImplementedError
 
     def _step(self, timeout: float, interruptible: bool) -> None:
-        """Send what is due, wait up to `timeout` seconds for messages, and process them. Only one thread may call this.
+        """Send waiting requests, wait up to `timeout` seconds for messages, and process them.
+
+        Only one thread at a time may call this method.
 
         Raises:
             Interrupted: the wait is `interruptible`, and one of the interrupting descriptors is ready.
@@ -281,7 +298,10 @@ class Connection(ClientCore):
         raise NotImplementedError
 
     def _drop(self) -> None:
-        """Close this process's descriptors, but not those of the parent process."""
+        """Close this process's copies of the descriptors.
+
+        A parent process keeps its own copies.
+        """
         raise NotImplementedError
 
 
@@ -300,7 +320,7 @@ class SocketConnection(Connection):
         keep_trying: float = 0.0,
         end: float | None = None,
     ) -> None:
-        """Connect to a server. The errors are those of `Client`.
+        """Connect to a server.
 
         Args:
             socket: path of the server's socket. The default is TALK_SOCKET, or else the usual places.
@@ -322,7 +342,7 @@ class SocketConnection(Connection):
         give_up = time.monotonic() + keep_trying
         attempt = connect(self._named, self._hello_message, patience, self._interrupt, attempt, keep_trying, end)
         self._patience = max(patience, round(give_up - time.monotonic(), 1))
-        #: None while disconnected
+        #: the socket, or None while disconnected
         self._socket: _socket.socket | None = attempt.socket
         assert attempt.server
         self.path, self.server = attempt.path, attempt.server
@@ -336,7 +356,7 @@ class SocketConnection(Connection):
         return None if self._socket is None else peers.credentials(self._socket)[0]
 
     def _send(self, exchange: Exchange) -> None:
-        """Queue the request of a registered exchange, and send as many bytes as the server accepts now."""
+        """Queue an exchange's request, and send as many bytes as the server accepts."""
         line = self.line(exchange)
         if exchange.on_failure and self.unsent_bytes + len(line) > MAX_UNSENT_BYTES:
             words = f"{MAX_UNSENT_BYTES >> 10} KiB are already waiting for the server at {self.path}"
@@ -345,7 +365,10 @@ class SocketConnection(Connection):
         self._flush()
 
     def _flush(self) -> None:
-        """Send as many bytes as the server accepts now. The caller must hold the lock `changed`."""
+        """Send as many bytes as the server accepts now.
+
+        The caller must hold the lock `changed`.
+        """
         try:
             while self._socket is not None and (data := self.outgoing()):
                 self.mark_sent(self._socket.send(data))
@@ -417,9 +440,9 @@ class ReconnectingConnection(SocketConnection):
         self._due = 0.0
 
     def begin(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> Exchange:
-        """Send a request, after reconnecting if necessary, and return its exchange without waiting."""
+        """Send a request, after reconnecting if necessary."""
         if on_failure is None:
-            self._read_available()  # notices if the connection has broken
+            self._read_available()  # this detects a broken connection
         with self.changed:
             if self.ended is None:
                 self._connect_again(time.monotonic(), at_once=isinstance(request, Cancel))
@@ -429,7 +452,10 @@ class ReconnectingConnection(SocketConnection):
         return super().begin(request, on_reply, on_failure)
 
     def break_off(self, why: str, now: float) -> None:
-        """Disconnect, and schedule an attempt to reconnect, unless the connection has ended for good."""
+        """Disconnect, and schedule an attempt to reconnect.
+
+        Do nothing if the connection has ended for good.
+        """
         if self.ended is not None:
             return
         was_greeted = self.greeted
@@ -459,7 +485,10 @@ class ReconnectingConnection(SocketConnection):
                 polled.close()
 
     def receive(self, data: bytes, now: float) -> None:
-        """Process received bytes. If the greeting refuses this client, disconnect and try again later."""
+        """Process received bytes.
+
+        If the greeting refuses this client, disconnect and try again later.
+        """
         try:
             super().receive(data, now)
         except TalkError as error:  # the greeting shows that the server can't be used
@@ -467,7 +496,10 @@ class ReconnectingConnection(SocketConnection):
             self._schedule_retry(error, now)
 
     def _connect_again(self, now: float, *, at_once: bool = False) -> None:
-        """Reconnect if disconnected and the pause between attempts is over. `at_once` ignores the pause."""
+        """Reconnect if the pause between attempts is over.
+
+        `at_once` ignores the pause.
+        """
         if self._socket is not None or (now < self._due and not at_once):
             return
         found = reach(self._named, only=self.path)
@@ -484,7 +516,9 @@ class ReconnectingConnection(SocketConnection):
         self.not_connected(error)
 
     def _give_up_socket(self) -> None:
-        """Disconnect. If a thread is reading, that thread closes the socket, because it may still be polling it.
+        """Disconnect.
+
+        If a thread is reading, that thread closes the socket, because it may still be polling it.
 
         The caller must hold the lock `changed`.
         """

@@ -1,12 +1,12 @@
 """The client's side of the protocol, without I/O.
 
 `ClientCore` turns requests into bytes, and received bytes into replies and events. A transport is a shell around it,
-which connects, and has the lock or the event loop. Its duties are:
+which connects, and has the lock or the event loop. The duties of a transport are:
 
 - Send the bytes that `outgoing()` returns, and report with `mark_sent()` how many were accepted.
 - Pass received bytes to `receive()`.
 - Call `expire()` at the time that `next_expiry()` returns, or earlier.
-- Call `end()` when the connection has ended for good, or `disconnected()` if the shell is going to connect again.
+- Call `end()` when the connection has ended for good, or `disconnected()` if it is going to reconnect.
 
 Rules for this file: no socket, thread, lock, asyncio or clock. Times are seconds of a monotonic clock, and are passed
 as arguments. The caller must make sure that only one thread at a time calls a method.
@@ -77,11 +77,13 @@ class EventBuffer:
         self._last_number: int | None = None
         #: why the buffer was closed, or None while it is open
         self.closed: str | None = None
-        #: whether the buffer is still used after the client has reconnected
+        #: whether to keep the buffer after reconnecting
         self.reconnects = reconnects
 
     def add(self, event: Event) -> None:
-        """Add an event unless it is a duplicate. Close the buffer if too many state changes are unread.
+        """Add an event unless it is a duplicate.
+
+        Close the buffer if too many state changes are unread.
 
         A connection that waits for a goal and also watches all goals receives each state twice.
         """
@@ -109,7 +111,7 @@ class EventBuffer:
 
 
 class EventListeners:
-    """The receivers of a connection's events: followed goals, and readers that watch all goals."""
+    """The receivers of a connection's events."""
 
     def __init__(self) -> None:
         #: the followed goals, by id. A goal can be followed several times.
@@ -118,16 +120,19 @@ class EventListeners:
         self.watches: WeakSet[EventBuffer] = WeakSet()
 
     def add(self, tracked: TrackedGoal) -> None:
-        """Pass a goal's events and all pauses to this object, until the goal has ended or is lost."""
+        """Pass a goal's events and all pauses to `tracked`."""
         self._goals.setdefault(tracked.goal.id, set()).add(tracked)
 
     @property
     def goals(self) -> dict[str, bool]:
-        """The ids of all followed goals, and whether any follower of a goal receives words."""
+        """The ids of the followed goals, and whether each needs words."""
         return {goal_id: any(each._with_feedback for each in some) for goal_id, some in self._goals.items()}
 
     def lose(self, goal_id: str, why: str) -> None:
-        """End a followed goal as LOST, and stop following it. `why` is a human-readable reason."""
+        """End a followed goal as LOST, and stop following it.
+
+        `why` is a human-readable reason.
+        """
         for tracked in self._goals.pop(goal_id, set()):
             tracked._mark_lost(why)
 
@@ -149,7 +154,10 @@ class EventListeners:
                 self.watches.discard(buffer)
 
     def publish(self, event: Event | None) -> None:
-        """Pass an event to the goals that it concerns and to the readers that watch all goals. None is ignored."""
+        """Pass an event to all its receivers.
+
+        Events of an unknown kind are None, and are ignored.
+        """
         if isinstance(event, Result):
             for tracked in self._goals.pop(event.goal.id, set()):
                 tracked._update(event.goal)
@@ -177,14 +185,14 @@ class TrackedGoal:
         self.attached = False
         #: whether all speech is paused, as far as the client knows
         self.speech_paused = False
-        #: monotonic time at which the server began to send the goal's events to this connection, or None
+        #: monotonic time since which the server has sent the goal's events, or None
         self._followed_at: float | None = None
         #: whether to buffer words and pauses, too
         self._with_feedback = False
         self._buffer = EventBuffer()
 
     def _expect(self, request: Say, now: float) -> None:
-        """Copy the id and text of an unanswered `say` request, and record whether it asks for events."""
+        """Prepare the goal for an unanswered `say` request."""
         self.goal = replace(self.goal, id=request.id or "", text=request.text)
         if request.wait:
             self._followed_at = now
@@ -196,7 +204,7 @@ class TrackedGoal:
         self.speech_paused = reply.get("paused") is True
 
     def _listen_to(self, listeners: EventListeners, *, feedback: bool, now: float) -> None:
-        """Start to receive the goal's events, which the server sends from `now` on."""
+        """Record that the server sends the goal's events from now on."""
         self._with_feedback = self._with_feedback or feedback
         if self._followed_at is None:
             self._followed_at = now
@@ -208,7 +216,7 @@ class TrackedGoal:
         self._update(replace(self.goal, text=(self.goal.text or "") + text))
 
     def _fail(self, error: TalkError) -> None:
-        """End the goal because `say` failed: as LOST if the goal may be spoken, and otherwise as REJECTED."""
+        """End the goal as LOST or REJECTED after a failed `say` request."""
         from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
 
         if isinstance(error, Lost):
@@ -219,7 +227,7 @@ class TrackedGoal:
             self._update(replace(self.goal, state=State.REJECTED, reason=reason, message=message))
 
     def _mark_lost(self, why: str) -> None:
-        """End the goal as LOST, unless it has already ended. `why` is a human-readable reason."""
+        """End the goal as LOST, unless it has already ended."""
         from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
 
         self._update(replace(self.goal, state=State.LOST, reason=Reason.LOST.value, message=f"result unknown: {why}"))
@@ -230,7 +238,7 @@ class TrackedGoal:
             self.goal = goal
 
     def _hear(self, event: StateChanged | WordHeard | events.TextMissing | PausedChanged | Goal) -> None:
-        """Update the goal from an event or from its state after reconnecting, and buffer the event."""
+        """Update the goal from an event, and buffer the event."""
         if self.goal.state.terminal:
             return
         if isinstance(event, Goal):
@@ -257,7 +265,10 @@ class TrackedGoal:
         return self.goal.state.terminal or bool(self._buffer)
 
     def _take(self) -> Event | None:
-        """Remove and return the oldest event, or else the Result of an ended goal, or None."""
+        """Remove and return the next event, ending with the Result.
+
+        Return None if nothing is new.
+        """
         return self._buffer.take() or (Result(self.goal) if self.goal.state.terminal else None)
 
 
@@ -268,19 +279,24 @@ class ServerInfo:
     boot: str = ""
     pid: int | None = None
     version: str = "unknown"
-    #: the names of the features that the server has; None if unknown
+    #: the names of the server's features; None if unknown
     features: tuple[str, ...] | None = None
 
     @classmethod
     def read(cls, server: JsonObject) -> ServerInfo:
-        """Read a description. An invalid field is treated as missing."""
+        """Read a description.
+
+        An invalid field is treated as missing.
+        """
         features = server.get("features")
         names = tuple(map(str, features)) if isinstance(features, list) else None
         return cls(**{**read_fields(cls, {**server, "features": None}), "features": names})
 
 
 def read_greeting(line: bytes, path: str) -> ServerInfo:
-    """Read a server's first line. Raises an error if the server can't be used.
+    """Read a server's first line.
+
+    Raises an error if the server can't be used.
 
     Raises:
         ServerUnavailable: the line is not a greeting.
@@ -291,7 +307,7 @@ def read_greeting(line: bytes, path: str) -> ServerInfo:
     except BadRequest:
         greeting = {}
     if "talk" not in greeting:
-        raise ServerUnavailable(f"the program that listens at {path} is not a talk server")
+        raise ServerUnavailable(f"the program listening at {path} is not a talk server")
     events.check_greeting(greeting)
     if "error" in greeting:
         from talkcli.terminal.text import printable  # rarely needed, and slow to import
@@ -302,7 +318,7 @@ def read_greeting(line: bytes, path: str) -> ServerInfo:
 
 
 class Exchange:
-    """A request of a client and its answer, which consists of list items and a reply."""
+    """A client's request and the server's answer to it."""
 
     def __init__(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> None:
         """Create an exchange, which must be registered before the request is sent.
@@ -315,7 +331,7 @@ class Exchange:
         """
         self.request = request
         self.on_reply, self.on_failure = on_reply, on_failure
-        #: the `seq` of the request and of its answer, or 0 if the exchange is not registered yet
+        #: the `seq` of the request and its answer, or 0 before registration
         self.number = 0
         #: whether the whole request was sent, so that the server may carry it out
         self.sent = False
@@ -324,7 +340,7 @@ class Exchange:
         self.reply: JsonObject | None = None
         #: the error, if the request failed
         self.error: TalkError | None = None
-        #: monotonic time of the last received line, or of the beginning of the exchange
+        #: monotonic time at which the exchange last made progress
         self.heard_at = 0.0
 
     @property
@@ -360,7 +376,7 @@ class ClientCore:
         self.listeners = EventListeners()
         #: why the connection has ended for good, or None if it hasn't
         self.ended: str | None = None
-        #: the unanswered exchanges, by number
+        #: the unanswered exchanges, by the `seq` of their requests
         self.exchanges: dict[int, Exchange] = {}
         #: whether the server has sent its greeting, so that requests may be sent
         self.greeted = True
@@ -375,9 +391,9 @@ class ClientCore:
         self._splitter = LineSplitter()
         #: monotonic time at which bytes were last received
         self._heard = now
-        #: the lines that are waiting to be sent, with their exchanges
+        #: unsent lines, each with its exchange
         self._unsent: deque[tuple[bytes, Exchange]] = deque()
-        #: number of bytes of the first waiting line that have already been sent
+        #: how many bytes of the first unsent line have been sent
         self._first_sent_bytes = 0
         #: the unsent part of the hello line, which is sent before the server's greeting arrives
         self._hello = b""
@@ -407,11 +423,11 @@ class ClientCore:
         self.exchanges[exchange.number] = exchange
 
     def line(self, exchange: Exchange) -> bytes:
-        """Return the line that sends the request of a registered exchange."""
+        """Return the line that contains the request of a registered exchange."""
         return request_line({"seq": exchange.number, **write_request(exchange.request)})
 
     def queue(self, line: bytes, exchange: Exchange) -> None:
-        """Append the line of an exchange to the bytes that are waiting to be sent.
+        """Queue an exchange's line for sending.
 
         Raises:
             ServerUnavailable: nothing more can be sent.
@@ -421,7 +437,7 @@ class ClientCore:
         self._unsent.append((line, exchange))
         early, self._sent_early = self._sent_early, b""
         if not line.startswith(early):
-            raise AssertionError(f"{early!r} was sent early instead of {line!r}")
+            raise AssertionError(f"the early request {early!r} differs from the request {line!r}")
         if early:
             self.mark_sent(len(early))
 
@@ -431,7 +447,7 @@ class ClientCore:
         return sum(len(line) for line, _ in self._unsent) - self._first_sent_bytes
 
     def outgoing(self) -> bytes:
-        """Return the bytes that can be sent now: the hello line, or the requests once the server has greeted."""
+        """Return the bytes that can be sent now."""
         if self._hello or not self.greeted:
             return self._hello
         return b"".join(line for line, _ in self._unsent)[self._first_sent_bytes :]
@@ -449,7 +465,9 @@ class ClientCore:
         self._first_sent_bytes = count
 
     def forget(self, exchange: Exchange) -> bool:
-        """Stop waiting for an answer, and remove the request if it is unsent. Return False if part of it was sent.
+        """Stop waiting for an answer, and remove the request if it is unsent.
+
+        Return False if part of it was sent.
 
         Returns:
             False if a part of the line has been sent. The connection must then be closed before the newline is sent,
@@ -465,7 +483,10 @@ class ClientCore:
         return True
 
     def stop_sending(self, why: str) -> None:
-        """Fail all unsent and later requests, for this reason. Answers to earlier requests can still be received."""
+        """Fail all unsent and later requests.
+
+        Answers to earlier requests can still be received.
+        """
         self._sending_ended = self._sending_ended or why
         unsent = [exchange for _, exchange in self._unsent]
         self._drop_unsent_lines()
@@ -473,7 +494,7 @@ class ClientCore:
             self.fail(exchange, self.unanswered(exchange))
 
     def answer(self, exchange: Exchange) -> tuple[JsonObject, list[JsonObject]]:
-        """Return the reply to a request and the items that came before it, or raise the request's error.
+        """Return the reply to a request and its list items, or raise its error.
 
         Raises:
             RequestRefused: the server refused the request.
@@ -485,7 +506,7 @@ class ClientCore:
         return exchange.reply, exchange.items
 
     def unanswered(self, exchange: Exchange) -> TalkError:
-        """Return the error for an unanswered request, which says whether the request was sent."""
+        """Return the error for an unanswered request."""
         request = exchange.request
         why = self.ended or (self.absence if self.absent_since is not None else "")
         if not exchange.sent:
@@ -511,7 +532,10 @@ class ClientCore:
         return ProtocolMismatch(f"the server is {version} and can't {ability}: restart it")
 
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
-        """Return the error that a refusing reply reports. `items` are the list items that came before the reply."""
+        """Return the error for a reply that refuses a request.
+
+        `items` are the list items before the reply.
+        """
         from talkcli.terminal.text import printable  # rarely needed, and slow to import
 
         error = reply.get("error")
@@ -521,7 +545,7 @@ class ClientCore:
     # -- time limits
 
     def answer_deadline(self, exchange: Exchange) -> float:
-        """Return the time by which a request must be sent, or by which the next line of its answer must arrive."""
+        """Return the time at which an exchange without progress fails."""
         if exchange.sent:
             return float("inf") if exchange.slow else exchange.heard_at + self._patience
         ttl = exchange.request.ttl if isinstance(exchange.request, Say) else None
@@ -538,7 +562,7 @@ class ClientCore:
         return max(began, self._heard) + SILENCE_LIMIT_S, f"the server sent nothing for {SILENCE_LIMIT_S:g} s"
 
     def goals_lost_at(self) -> float:
-        """Return the time at which followed goals become LOST if the client hasn't reconnected."""
+        """Return the time at which followed goals become LOST while disconnected."""
         return float("inf") if self.absent_since is None else self.absent_since + self._patience
 
     def next_expiry(self) -> float:
@@ -549,7 +573,9 @@ class ClientCore:
         return min(times, default=float("inf"))
 
     def expire(self, now: float) -> bool:
-        """Fail requests that have reached their time limit, and end goals as LOST after a long disconnection.
+        """Fail late requests, and end goals after a long disconnection.
+
+        Return False if the connection must be closed.
 
         Returns:
             False if the connection must be closed, because a part of a line has been sent (see `forget`).
@@ -565,9 +591,9 @@ class ClientCore:
     # -- receiving
 
     def split(self, data: bytes, now: float) -> list[bytes]:
-        """Add received bytes, record their time, and return the lines that are now complete.
+        """Add received bytes, and return the lines that are now complete.
 
-        Shells that pass lines on undecoded use this method instead of `receive`.
+        Transports that pass lines on without decoding them use this method instead of `receive`.
         """
         self._heard = now
         return self._splitter.feed(data)
@@ -595,12 +621,14 @@ class ClientCore:
                 self.break_off(f"the server sent a malformed message: {error}", now)
 
     def match(self, message: JsonObject) -> Exchange | None:
-        """Return the exchange to which a message belongs, or None if there is none."""
+        """Return the exchange to which a message belongs, if there is one."""
         number = message.get("seq")
         return self.exchanges.get(number) if isinstance(number, int) else None
 
     def dispatch(self, message: JsonObject, now: float) -> Exchange | None:
-        """Process a received event, list item or reply, and return the exchange that it ends, or None.
+        """Process a received event, list item or reply.
+
+        Return the exchange that a reply has ended, if any.
 
         Raises:
             ValueError: the event, or a goal in the reply, is malformed.
@@ -621,7 +649,9 @@ class ClientCore:
         return exchange
 
     def _finish(self, exchange: Exchange, reply: JsonObject) -> None:
-        """End an exchange with its reply, or with an error if the reply is a refusal. Calls the callbacks.
+        """End an exchange after its reply has arrived.
+
+        Calls the callbacks.
 
         Raises:
             Unreadable: a goal in the reply is malformed.
@@ -643,18 +673,24 @@ class ClientCore:
     # -- disconnecting and reconnecting
 
     def break_off(self, why: str, now: float) -> None:  # noqa: ARG002 - for subclasses that reconnect
-        """Break the connection. This ends it for good, unless a subclass reconnects."""
+        """End the connection for good, unless a subclass reconnects."""
         self.end(why)
 
     def end(self, why: str) -> None:
-        """End the connection for good, and fail all unanswered requests. Received events can still be read."""
+        """End the connection for good, and fail all unanswered requests.
+
+        Received events can still be read.
+        """
         if self.ended is not None:
             return
         self.ended = self._last_error or why
         self._fail_all()
 
     def disconnected(self, why: str, now: float) -> None:
-        """Record that the connection has broken. Fail unanswered requests, and end watches that don't reconnect."""
+        """Record that the connection has broken.
+
+        Fail unanswered requests, and end watches that don't reconnect.
+        """
         self.absence = self._last_error or why
         self.absent_since, self._last_error, self._sending_ended = now, None, None
         self.greeted = False
@@ -664,21 +700,26 @@ class ClientCore:
         self.listeners.end_watches(why, include_reconnecting=False)
 
     def connecting(self, hello: bytes) -> None:
-        """Prepare for a new connection, on which `hello` is sent first. Requests wait for the server's greeting."""
+        """Prepare for a new connection, which begins with `hello`.
+
+        Requests wait for the server's greeting.
+        """
         self.greeted, self._hello = False, hello
         self.begin_stream()
 
     def not_connected(self, error: TalkError) -> None:
-        """Record that an attempt to reconnect has failed, and fail all requests without an `on_failure`."""
+        """Record a failed attempt to reconnect, and fail requests that callers wait for."""
         self.connect_error = error
         for exchange in [each for each in self.exchanges.values() if not each.on_failure]:
             self.forget(exchange)
             self.fail(exchange, error)
 
     def connected(self, server: ServerInfo, now: float) -> None:
-        """Record the greeting on a new connection, and follow goals again, or mark them LOST after a restart.
+        """Record the greeting on a new connection.
 
-        Goals are followed again if this is still the same run of the server. Otherwise they are LOST.
+        Follow all goals again, or end them as LOST.
+
+        Goals are followed again if the server wasn't restarted in the meantime. Otherwise they are LOST.
 
         Args:
             server: the server's greeting. Each start of the server has another boot id.
@@ -701,7 +742,7 @@ class ClientCore:
                 self.queue(self._renew_line(exchange, now), exchange)
 
     def _renew_line(self, exchange: Exchange, now: float) -> bytes:
-        """Reduce a waiting request's TTL by the time waited, restart its time limit, and return its line."""
+        """Return a waiting request's line, with its TTL reduced by the time waited."""
         request = exchange.request
         if isinstance(request, Say) and request.ttl:
             exchange.request = replace(request, ttl=max(MIN_TTL_S, request.ttl - (now - exchange.heard_at)))
@@ -717,7 +758,7 @@ class ClientCore:
                     self.listeners.update(goal)
 
         def on_failure(error: TalkError) -> None:
-            if self.absent_since is None:  # if the connection broke again, the goal is followed on the next one
+            if self.absent_since is None:  # if the connection breaks again, the next one follows the goal
                 self.listeners.lose(goal_id, f"{error.message}; the sentence may have been spoken")
 
         self._begin(Exchange(Wait((goal_id,), feedback), on_reply, on_failure), now)
@@ -740,7 +781,7 @@ class ClientCore:
         self.queue(self.line(exchange), exchange)
 
     def fail(self, exchange: Exchange, error: TalkError) -> None:
-        """End an exchange with an error and call its `on_failure`, unless the exchange has already ended."""
+        """End an exchange with an error, unless it has already ended."""
         if exchange.over:
             return
         exchange.error = error
@@ -749,7 +790,7 @@ class ClientCore:
             exchange.on_failure(error)
 
     def _fail_all(self) -> None:
-        """Fail all unanswered requests, and send nothing more of them."""
+        """Fail all unanswered requests, and discard their unsent bytes."""
         self._drop_unsent_lines()
         for exchange in list(self.exchanges.values()):
             self.fail(exchange, self.unanswered(exchange))
@@ -760,6 +801,6 @@ class ClientCore:
             self.listeners.lose(goal_id, f"{self.absence}; the sentence may still be spoken")
 
     def _drop_unsent_lines(self) -> None:
-        """Remove all lines that are waiting to be sent. Their exchanges don't fail."""
+        """Remove all unsent lines, without failing their exchanges."""
         self._unsent.clear()
         self._first_sent_bytes = 0

@@ -28,7 +28,9 @@ if TYPE_CHECKING:
 
 
 class GoalHandle(TrackedGoal):
-    """A handle for a goal that this client has sent or follows. Any number of threads may use it.
+    """A handle for a goal that this client has sent or follows.
+
+    Any number of threads may use it.
 
     Events are buffered until they are read. If there are more than 5,000 words and pauses, the oldest are dropped.
     `events`, `feedback` and `poll` read from the same buffer, so each event is returned only once. A new loop continues
@@ -48,11 +50,16 @@ class GoalHandle(TrackedGoal):
 
     @property
     def state(self) -> State:
-        """The goal's last known state. Calls that read from the server update it, for example `wait` and `poll`."""
+        """The goal's last known state.
+
+        Calls that read from the server update it, for example `wait` and `poll`.
+        """
         return self.goal.state
 
     def wait(self, timeout: float | None = None) -> Goal:
         """Wait until the goal has ended, and return it.
+
+        Raise TimeoutError if `timeout` expires first.
 
         If the goal can no longer be followed, for example because the server was restarted, the goal ends as LOST. It
         may or may not have been spoken.
@@ -102,16 +109,20 @@ class GoalHandle(TrackedGoal):
         return (each for each in self._iterate_events(end, timeout) if isinstance(each, WordHeard))
 
     def poll(self) -> Event | None:
-        """Read from the server without blocking, and return the goal's next event, or None. The Result comes last.
+        """Read from the server without blocking.
 
-        Call this method regularly, because each call also receives the events of other goals, and sends the rest of
-        earlier requests.
+        Return the goal's next event, or None if there is none.
+
+        The Result is the last event. Call this method regularly, because each call also receives the events of other
+        goals, and sends the rest of earlier requests.
 
         Raises:
             UsageError: the goal was sent with `follow=False`, and neither `wait` nor `events` has been called.
         """
         if self._followed_at is None and not self.state.terminal:
-            raise UsageError(f"goal {self.id} was sent with follow=False; leave that out to get its events")
+            raise UsageError(
+                f"goal {self.id} was sent with follow=False; to get the goal's events, leave out follow=False"
+            )
         since = None if self.state.terminal else self._followed_at
         self._connection.wait_until(lambda: False, time.monotonic(), since=since, interruptible=False)
         if not self._has_event():
@@ -133,11 +144,12 @@ class GoalHandle(TrackedGoal):
         if self.id and (not self.state.terminal or self.state is State.LOST):
             failures: list[TalkError] = []
             self._connection.submit(Cancel((self.id,)), lambda *_: None, failures.append)
-            if failures and self._connection.unsent_bytes:  # the buffer is full; after a break, it would be empty
+            # If the connection has broken instead, the buffer is empty.
+            if failures and self._connection.unsent_bytes:
                 raise failures[0]
 
     def cancel(self) -> Goal:
-        """Cancel the goal, and return it once it has ended and is silent.
+        """Cancel the goal, and return it once it is silent.
 
         Raises:
             UnknownGoal: the server doesn't know the goal, for example because the server was restarted.
@@ -155,11 +167,17 @@ class GoalHandle(TrackedGoal):
     # -- internal
 
     def _listen(self, *, feedback: bool) -> None:
-        """Register for the goal's events, optionally with words. The caller must hold the connection's lock."""
+        """Register for the goal's events, optionally with words.
+
+        The caller must hold the connection's lock.
+        """
         self._listen_to(self._connection.listeners, feedback=feedback, now=time.monotonic())
 
     def _iterate_events(self, end: float | None, timeout: float | None) -> Iterator[Event]:
-        """Yield the goal's events up to its Result. Raises TimeoutError if `end` (monotonic) passes first."""
+        """Yield the goal's events up to its Result.
+
+        Raises TimeoutError if `end` (monotonic) passes first.
+        """
         for event in take_repeatedly(self._connection, self._take, end):
             if event is None:
                 self._give_up(timeout)
@@ -171,7 +189,7 @@ class GoalHandle(TrackedGoal):
                 yield event
 
     def _follow(self, *, feedback: bool) -> None:
-        """Ask the server to send the goal's events, unless it already does or the goal has ended."""
+        """Ask the server to send the goal's events, if necessary."""
         if self.state.terminal or (self._followed_at is not None and (self._with_feedback or not feedback)):
             return
 
@@ -182,12 +200,15 @@ class GoalHandle(TrackedGoal):
         self._connection.request(Wait((self.id,), feedback), accepted)
 
     def _give_up(self, timeout: float | None) -> None:
-        """End the goal as LOST if the connection has ended, or else raise TimeoutError."""
+        """End the goal as LOST if the connection has ended, or raise TimeoutError."""
         if not self._lose_if_disconnected():
             raise TimeoutError(f"goal {self.id} has not ended after {0 if timeout is None else round(timeout, 1):g} s")
 
     def _lose_if_disconnected(self) -> bool:
-        """End the goal as LOST if the connection has ended. Return whether the connection has ended."""
+        """End the goal as LOST if the connection has ended.
+
+        Return whether the connection has ended.
+        """
         ended = self._connection.ended
         if ended is not None:
             with self._connection.changed:
@@ -196,7 +217,7 @@ class GoalHandle(TrackedGoal):
 
 
 def merged(handles: Sequence[GoalHandle], timeout: float | None = None) -> Iterator[tuple[GoalHandle, Event]]:
-    """Yield the events of several goals, each with its goal's handle, until all of the goals have ended.
+    """Yield the events of several goals until all of them have ended.
 
     The last event of each goal is its Result. A pause of all speech is yielded only once. If the connection ends, the
     remaining goals end as LOST.
@@ -231,11 +252,14 @@ class _EventStream:
         self.unfinished = list({each.id: each for each in handles}.values())
         #: the number of each goal's last event
         self._last_numbers: dict[str, int] = {}
-        #: the number of the last pause, which is yielded only once although every goal receives it
+        #: the number of the last pause. Every goal receives it, but it is yielded only once.
         self._last_pause = 0
 
     def take(self) -> list[tuple[GoalHandle, Event]]:
-        """Remove and return the new events of all goals in order. The caller must hold the connection's lock."""
+        """Remove and return the new events of all goals in order.
+
+        The caller must hold the connection's lock.
+        """
         found: list[tuple[int, GoalHandle, Event]] = []
         for handle in self.unfinished:
             event: Event | None = None
@@ -257,5 +281,5 @@ class _EventStream:
 
 
 def _end_time(timeout: float | None) -> float | None:
-    """Return the monotonic time at which a timeout expires, or None if there is no timeout."""
+    """Return the monotonic time at which a timeout expires."""
     return None if timeout is None else time.monotonic() + timeout

@@ -1,4 +1,4 @@
-"""The log of a long-running process, which is written to standard error.
+"""The log of a long-running process, written to standard error.
 
 Writing a line never blocks and never fails. Text from other programs must go through `sanitize`, so that it can't forge
 a line or send control characters to a terminal.
@@ -41,9 +41,9 @@ class RateLimit:
         self._event_count = 0
 
     def count_event(self, now: float) -> int | None:
-        """Count an event. Return how many events were suppressed before it, or None to suppress it, too.
+        """Count an event.
 
-        If the event is allowed, return how many events have been suppressed since the last allowed event.
+        Return how many events have been suppressed since the last allowed event, or None to suppress this one.
         """
         if now >= self._period_end:
             suppressed = max(0, self._event_count - self._max_events)
@@ -53,21 +53,24 @@ class RateLimit:
         return 0 if self._event_count <= self._max_events else None
 
 
-#: Number of lines that were lost since the last successful write.
+#: Number of lines lost since the last successful write.
 _lost_lines = 0
 #: The rate limits of `write_limited`, by kind of line.
 _rate_limits: dict[str, RateLimit] = {}
 
 
 def write(message: str) -> None:
-    """Write a line to the log. The line is dropped if standard error can't accept it at once."""
+    """Write a line to the log.
+
+    The line is dropped if standard error can't accept it at once.
+    """
     global _lost_lines  # noqa: PLW0603
     if _lost_lines:
         message = f"{message} ({_lost_lines} lines before this one could not be written)"
     data = f"talk: {message}\n".encode(errors="backslashreplace")
     if len(data) > _MAX_LOG_LINE_BYTES:
         data = data[: _MAX_LOG_LINE_BYTES - 1] + b"\n"
-    with contextlib.suppress(OSError, ValueError):  # ValueError: standard error has been closed
+    with contextlib.suppress(OSError, ValueError):  # ValueError if standard error is closed
         fd = sys.stderr.fileno() if sys.stderr else 2
         if wait_ready({fd: select.POLLOUT}, 0):
             os.write(fd, data)
@@ -77,7 +80,7 @@ def write(message: str) -> None:
 
 
 def write_limited(kind: str, message: str) -> None:
-    """Write a line to the log, unless a line of this kind was written less than a minute ago.
+    """Write a line to the log, at most once a minute for each kind.
 
     The next line of the kind gives the number of suppressed lines.
     """
@@ -94,7 +97,7 @@ def write_bug(context: str, error: Exception) -> None:
 
 
 def handle_loop_error(_loop: object, context: Mapping[str, Any]) -> None:
-    """Log an error that the event loop caught. This is the loop's exception handler."""
+    """Log an error that the event loop caught."""
     error, message = context.get("exception"), str(context.get("message"))
     if isinstance(error, Exception):
         write_bug(message, error)
@@ -103,5 +106,5 @@ def handle_loop_error(_loop: object, context: Mapping[str, Any]) -> None:
 
 
 def sanitize(text: str) -> str:
-    """Return untrusted text in a form that is safe for the log: escaped and shortened."""
+    """Escape and shorten untrusted text for the log."""
     return printable(text, _MAX_LOGGED_TEXT_CHARS)

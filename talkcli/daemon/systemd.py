@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     import asyncio
     from collections.abc import Callable
 
-#: Delay between a status change and its notification, so that many changes in a row cause only one notification.
+#: Delay before a status change is reported, so that several changes in a row cause only one notification.
 STATUS_DELAY_S = 0.5
 #: Delay before a failed notification is sent again.
 NOTIFY_RETRY_DELAY_S = 0.5
-#: Number of watchdog notifications per watchdog timeout. As there are more than two, one may be late.
+#: Number of notifications per watchdog timeout. One of them may be late.
 _NOTIFICATIONS_PER_TIMEOUT_COUNT = 2.5
 
 
@@ -50,8 +50,7 @@ class ServiceManager:
         #: timers of scheduled notifications, by name
         self._timers: dict[str, asyncio.TimerHandle] = {}
         if self._address:
-            # Open the socket now, because watchdog notifications must still be sent if the process runs out of
-            # descriptors.
+            # Open the socket now, in case the process runs out of descriptors later.
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
             self._socket.setblocking(False)
 
@@ -61,7 +60,7 @@ class ServiceManager:
         self._notify_watchdog()
 
     def schedule_status(self) -> None:
-        """Report the process's status after a short delay, unless this is already scheduled."""
+        """Schedule a report of the process's status."""
         self._schedule("status", STATUS_DELAY_S, self._notify_status)
 
     def notify_stopping(self) -> None:
@@ -79,13 +78,13 @@ class ServiceManager:
             self._socket = None
 
     def _notify_status(self) -> None:
-        """Report the process's status if it has changed, unless the process is stopping."""
+        """Report the process's status if it has changed."""
         status = self._describe_status()
         if self._status not in {status, "stopping"}:
             self._send(STATUS=status)
 
     def _notify_watchdog(self) -> None:
-        """If there is a watchdog, notify it now and schedule the next notification."""
+        """Notify the watchdog, and schedule the next notification."""
         if self._watchdog_interval:
             self._send(WATCHDOG="1")
             self._schedule("watchdog", self._watchdog_interval, self._notify_watchdog)
@@ -102,7 +101,7 @@ class ServiceManager:
         self._timers[name] = self._loop.call_later(seconds, act)
 
     def _send(self, **fields: str) -> None:
-        """Send these fields together with unsent ones. If this fails, try again later."""
+        """Send these fields and any unsent ones, and retry later if this fails."""
         if self._socket is None:
             return
         self._status = fields.get("STATUS", self._status)
@@ -111,7 +110,7 @@ class ServiceManager:
         try:
             self._socket.sendto(data, self._address)
         except OSError as error:
-            if not isinstance(error, BlockingIOError):  # BlockingIOError: the queue is full
+            if not isinstance(error, BlockingIOError):  # BlockingIOError means that the queue is full
                 log.write_limited("supervisor", f"can't notify the service manager (NOTIFY_SOCKET): {error.strerror}")
             self._schedule("retry", NOTIFY_RETRY_DELAY_S, self._send)
         else:
@@ -119,14 +118,17 @@ class ServiceManager:
 
 
 def _parse_notify_address(value: str) -> str:
-    """Convert the value of NOTIFY_SOCKET to a socket address. Return "" if it is unset or invalid."""
+    """Convert the value of NOTIFY_SOCKET to a socket address.
+
+    Return "" if it is unset or invalid.
+    """
     if value.startswith("@"):
-        return "\0" + value[1:]  # an abstract socket, which Linux names with @
+        return "\0" + value[1:]  # in Linux, @ stands for an abstract socket
     return value if os.path.isabs(value) else ""
 
 
 def _watchdog_interval() -> float | None:
-    """Return the seconds between two watchdog notifications, or None if the environment sets no watchdog."""
+    """Return the seconds between two watchdog notifications, or None without a watchdog."""
     timeout, own_pid = os.environ.get("WATCHDOG_USEC", ""), str(os.getpid())
     is_for_us = os.environ.get("WATCHDOG_PID", own_pid) == own_pid  # the watchdog may watch another process
     timeout_us = int(timeout) if timeout.isdecimal() and is_for_us else 0

@@ -1,4 +1,4 @@
-"""The checks of a fleet's broker, and of one robot that is connected to it.
+"""Checks of an MQTT broker and one of its robots.
 
 The checks use the rights of an operator, or those of the robot's bridge if the login is the robot's name. They have no
 side effects, because the broker doesn't retain the test messages, and bridges ignore them.
@@ -43,10 +43,9 @@ _Result = TypeVar("_Result")
 #: Time limit for each check. It is longer than `LOGIN_LIMIT_S`, because looking up the broker's host name also takes
 #: time.
 _STEP_LIMIT_S = 2 * LOGIN_LIMIT_S
-#: How long to wait for a test message, and for the presence of robots, after the broker has acknowledged all messages.
+#: How long to wait for test messages and presence messages after the broker has acknowledged everything.
 _RETURN_LIMIT_S = 1.0
-#: Payload of the test message that the broker should send back. Bridges use another payload for their own test
-#: messages.
+#: Payload of the doctor's test message. Bridges use another payload for theirs.
 _ECHO_PAYLOAD = b"doctor"
 #: A warning is shown if the certificate expires within this time.
 _RENEWAL_LIMIT_S = 14 * 86400
@@ -58,7 +57,7 @@ _UNREACHABLE_STEPS = {
     "no such host": "correct the host in TALK_BROKER, and check it: getent hosts {host}",
     _NO_ANSWER: "check that {host} is up and that no firewall blocks it: ping {host}",
 }
-#: OpenSSL's error codes for a certificate with an invalid date, and for a certificate of another host.
+#: OpenSSL's error codes for a certificate with an invalid date or the wrong host name.
 _DATE_CODES, _HOST_CODES = (9, 10), (62, 64)
 _LOG_STEP = "read the broker's log: journalctl -u mosquitto"
 
@@ -98,7 +97,10 @@ class BrokerExamination:
         self.question = BRIDGE_QUESTION if self._is_robot else ROBOT_QUESTION
 
     def findings(self) -> Iterator[Finding]:
-        """Run the checks, and yield their findings. Stop at a failure that makes further checks impossible."""
+        """Run the checks, and yield their findings.
+
+        Stop at a failure that makes further checks impossible.
+        """
         try:
             broker = from_environment(self._environment, insecure=self._insecure)
             name, context = client_user(broker), broker.ssl_context()
@@ -132,7 +134,7 @@ class BrokerExamination:
             yield self._ask_robot(broker)
 
     def _check_connection(self, broker: Broker, context: ssl.SSLContext | None) -> Iterator[Finding]:
-        """Connect to the broker without logging in, and yield the findings about the connection and the certificate."""
+        """Check the connection to the broker and the broker's certificate."""
         began = time.monotonic()
         try:
             connection = self._wait_for(partial(socket.create_connection, (broker.host, broker.port), LOGIN_LIMIT_S))
@@ -153,7 +155,10 @@ class BrokerExamination:
             yield judge_certificate(broker, expires_at, time.time())
 
     def _log_in(self, broker: Broker) -> Link:
-        """Connect to the broker, log in, and return the connection. Raises the same errors as `Link.open`."""
+        """Log in to the broker, and return the connection.
+
+        Raises the same errors as `Link.open`.
+        """
         name = f"talk-doctor-{os.urandom(8).hex()}"
         link = Link(broker, name, self._inbox.append, receive_maximum=MAX_RECEIVE_COUNT)
         try:
@@ -163,16 +168,25 @@ class BrokerExamination:
         return link
 
     def _check_anonymous(self, broker: Broker) -> Finding:
-        """Try to log in without credentials, and return the finding. It is a warning if the broker allows this."""
+        """Try to log in without credentials.
+
+        The finding is a warning if the broker allows this.
+        """
         try:
             self._log_in(replace(broker, user=None, password=None, cert=None, key=None)).close()
         except TalkError:
             return ok("anonymous", "the broker rejects clients without credentials")
         words = "the broker accepts clients without credentials: anybody on the network can make the robots speak"
-        return warning("anonymous", words, "allow_anonymous false in mosquitto.conf; then: talk bridge --print-acl")
+        return warning(
+            "anonymous",
+            words,
+            "set allow_anonymous false in mosquitto.conf, and add access rules: talk bridge --print-acl",
+        )
 
     def _test_rights(self, link: Link, user: str) -> tuple[Finding, dict[str, Presence]]:
-        """Publish messages to test the user's rights. Return the finding about them, and robots' presences by name.
+        """Test the user's access rights by publishing messages.
+
+        Return the finding, and the presences of robots by name.
 
         The user needs the rights of an operator, or those of this robot's bridge. Other robots are only read if this
         robot's presence is missing, and the user isn't the robot.
@@ -214,7 +228,7 @@ class BrokerExamination:
         return judge_rights(user, unwritable, unreadable, trouble), presences
 
     def _ask_robot(self, broker: Broker) -> Finding:
-        """Request the status of the robot's server, and return the finding about the answer."""
+        """Check whether the robot's server answers a status request."""
         end = time.monotonic() + _STEP_LIMIT_S
         try:
             connection = connect_robot(
@@ -230,7 +244,7 @@ class BrokerExamination:
             return failure("bridge", wrong, remedy or step)
 
     def _wait_for(self, function: Callable[[], _Result]) -> _Result:
-        """Run a blocking function in a thread with a time limit, and return its result.
+        """Run a blocking function in a thread with a time limit.
 
         Raises:
             TimeoutError: The work takes too long. The thread continues, but its result is ignored.
@@ -254,13 +268,13 @@ class BrokerExamination:
 
 
 def _read_expiry(connection: socket.socket, context: ssl.SSLContext, host: str) -> float:
-    """Start TLS on a connection, and return when the broker's certificate expires, in seconds since 1970."""
+    """Start TLS, and return when the broker's certificate expires, in seconds since 1970."""
     with context.wrap_socket(connection, server_hostname=host) as secured:
         return ssl.cert_time_to_seconds(str((secured.getpeercert() or {})["notAfter"]))
 
 
 def _explain_error(error: OSError | UnicodeError) -> str:
-    """Return a short text that says why a connection to the broker failed."""
+    """Describe briefly why a connection to the broker failed."""
     if isinstance(error, ssl.SSLCertVerificationError):
         return error.verify_message
     if isinstance(error, ssl.SSLError):
@@ -285,7 +299,10 @@ def judge_settings(message: str, *, has_url: bool) -> Finding:
 
 
 def judge_unreachable(broker: Broker, reason: str) -> Finding:
-    """Return the finding about a broker that can't be reached. `reason` is a text of `_explain_error`."""
+    """Return the finding about a broker that can't be reached.
+
+    `reason` is a text of `_explain_error`.
+    """
     step = _UNREACHABLE_STEPS.get(reason, _UNREACHABLE_STEPS[_NO_ANSWER])
     return failure("broker", f"{broker.url}: {reason}", step.format(host=broker.host, port=broker.port))
 
@@ -324,12 +341,15 @@ def judge_tls_error(broker: Broker, message: str, code: int, now: float) -> Find
 
 
 def _describe_cas(broker: Broker) -> str:
-    """Return words for the CAs against which the broker's certificate is checked."""
+    """Describe the CAs that the broker's certificate is checked against."""
     return f"the CA in {broker.ca}" if broker.ca else "the system's CAs"
 
 
 def _advise_on_tls_error(broker: Broker, message: str, code: int, now: float) -> str:
-    """Return advice on how to fix a TLS error. The arguments are those of `judge_tls_error`."""
+    """Return advice on how to fix a TLS error.
+
+    The arguments are those of `judge_tls_error`.
+    """
     if code in _DATE_CODES:
         clock = time.strftime("%Y-%m-%d %H:%M", time.gmtime(now))
         return f"renew the certificate of {broker.host}; or set this machine's clock, which shows {clock} UTC"
@@ -339,12 +359,15 @@ def _advise_on_tls_error(broker: Broker, message: str, code: int, now: float) ->
         return "log in with a certificate that the broker accepts: set TALK_MQTT_CERT and TALK_MQTT_KEY"
     if not code:
         return f"if port {broker.port} of {broker.host} has no TLS, use its TLS port in {URL}; otherwise, {_LOG_STEP}"
-    other = "another file," if broker.ca else "the file"
-    return f"name {other} of the CA that issued the certificate of {broker.host}: {CA}=FILE"
+    file = "another file" if broker.ca else "a file"
+    return f"set {CA} to {file} with the certificate of the CA that issued the certificate of {broker.host}"
 
 
 def judge_login(broker: Broker, refusal: str | None) -> Finding:
-    """Return the finding about the login. `refusal` is the broker's reason for refusing it, or None."""
+    """Return the finding about the login.
+
+    `refusal` is the broker's reason for refusing it, or None.
+    """
     if refusal is not None:
         wrong, _, remedy = refusal.partition("; ")
         step = _LOG_STEP
@@ -361,7 +384,7 @@ def judge_login(broker: Broker, refusal: str | None) -> Finding:
 
 
 def judge_presence(presence: Presence, now: float) -> Finding:
-    """Return the finding about whether the robot is online and has a server, from its presence message."""
+    """Return the finding about a robot's presence message."""
     robot = presence.name
     if not presence.online:
         step = f"check its network and power; on {robot}, run: systemctl status talk-bridge"
@@ -379,7 +402,7 @@ def judge_presence(presence: Presence, now: float) -> Finding:
 
 
 def judge_unknown_robot(robot: str, known_robots: list[str], user: str, *, has_rights: bool) -> Finding:
-    """Return the finding about a robot for which the broker sends no presence message.
+    """Return the finding about a robot without a presence message.
 
     Args:
         robot: the robot's name.
@@ -402,7 +425,7 @@ def judge_unknown_robot(robot: str, known_robots: list[str], user: str, *, has_r
 
 
 def judge_rights(user: str, unwritable: tuple[str, ...], unreadable: tuple[str, ...], error: str | None) -> Finding:
-    """Return the finding about the user's access rights, as shown by test messages.
+    """Return the finding about the user's access rights.
 
     Args:
         user: the user's name.
@@ -418,11 +441,11 @@ def judge_rights(user: str, unwritable: tuple[str, ...], unreadable: tuple[str, 
         return failure("rights", words, "add the missing lines to the broker's acl_file: talk bridge --print-acl")
     if error is not None:
         return failure("rights", f"the rights of '{user}' could not be tested: {error}", _LOG_STEP)
-    return ok("rights", f"the broker allows '{user}' everything that is needed")
+    return ok("rights", f"the broker gives '{user}' all the rights that are needed")
 
 
 def judge_server_status(robot: str, server: JsonObject, answer_s: float) -> Finding:
-    """Return the finding about the status that the robot's server sent within `answer_s` seconds."""
+    """Return the finding about the status of the robot's server."""
     words = f"{robot} answered in {answer_s * 1000:.0f} ms: {summarize_server(server)}"
     if server.get("paused") is True:
         return warning("bridge", f"speech is paused; {words}", f"talk --robot {robot} resume")

@@ -74,7 +74,10 @@ class LocalExamination:
                 yield finding
 
     def _run_checks(self, client: Client | None, socket_finding: Finding) -> Iterator[Finding]:
-        """Run all checks, and yield their findings. The arguments are the results of `server.connect`."""
+        """Run all checks, and yield their findings.
+
+        The arguments are the results of `server.connect`.
+        """
         of_server: list[Finding] = []
         if client is not None:
             try:
@@ -103,24 +106,27 @@ class LocalExamination:
         yield self._speak_sentence()
 
     def _setting(self, name: str, variable: str = "") -> str | None:
-        """Return a server setting, or an environment variable if there is no server. Return None if it isn't set."""
+        """Return a server setting, or an environment variable if there is no server.
+
+        Return None if it isn't set.
+        """
         value = self._server.get(name) if self._server else os.environ.get(variable)
         return str(value) if value else None
 
     @property
     def _player(self) -> str | None:
-        """The configured player, or None for the automatic choice."""
+        """The player that was configured, or None if the engine chooses one."""
         return self._setting("player", "TALK_PLAYER")
 
     def _check_neural(self) -> Iterator[Finding]:
-        """Check neural voices if one is installed or in use, and yield the findings."""
+        """Check neural voices if one is installed or in use."""
         used, engine, env = self._setting("voice", "TALK_VOICE"), self._engine, self._env
         reported = self._server.get("neural_voices")
         server_voices = reported if isinstance(reported, dict) else {}
         if used and not is_neural(used):
             if engine.ready is not None:
                 used = engine.ready.voice
-            elif not find_voice(used, models.undescribed_voices(env)):  # this voice may be why the engine failed
+            elif not find_voice(used, models.undescribed_voices(env)):  # this voice may be the cause
                 used = None
         needed = used or server_voices or any(map(is_neural, engine.voices or ())) or env.get("TALK_VOICES")
         if not needed or not is_own_driver(self._setting("driver")):
@@ -132,7 +138,7 @@ class LocalExamination:
         yield from voice.check_neural(used, options, SENTENCE_LIMIT_S, server_voices if self._client else None)
 
     def _check_sound(self) -> Iterator[Finding]:
-        """Check everything between the engine and the loudspeaker, and yield the findings."""
+        """Check everything between the engine and the loudspeaker."""
         env, session, device, by_server = self._env, self._session, self._setting("device"), self._client is not None
         if not is_own_driver(self._setting("driver")):
             return  # pyttsx3's other drivers play the sound themselves
@@ -156,7 +162,7 @@ class LocalExamination:
         yield from sound.check_levels(env, sound_server, cards, is_used=device is None and used in PLAYERS)
 
     def _speak_sentence(self) -> Finding:
-        """Speak the doctor's sentence, audibly or silently, and return the finding about it."""
+        """Speak the doctor's sentence, and return the finding about it."""
         client, engine, player = self._client, self._engine, self._player
         if client is not None and self._silent:
             if self._server_pid is None:
@@ -174,7 +180,7 @@ class LocalExamination:
         step = sentence.find_playback_step(self._findings, custom=custom)
         if self._silent and self._server_pid is not None and self._session.server_pid is None:
             # The server belongs to another user, so its environment can't be read. If /proc is mounted with the option
-            # hidepid, the server's owner can't be found out either.
+            # hidepid, the server's owner is unknown too.
             owner = sound.file_owner(f"/proc/{self._server_pid}")
             step = step if owner is None else sentence.RUN_AS_OWNER.format(owner)
         if result.reason == Reason.AUDIO_STALLED and not (self._hangs or custom):
@@ -183,7 +189,7 @@ class LocalExamination:
         return sentence.judge_sentence(result, silent=silent, device=device, playback_step=step, hangs=self._hangs)
 
     def _copy_server_options(self, server_pid: int) -> voice.EngineOptions:
-        """Return options with which the doctor's own engine uses the same player, device and voice as the server."""
+        """Return engine options with the server's player, device and voice."""
         player, first = self._player, None
         if is_silent(player):
             player = "null"  # don't write to the server's output file

@@ -1,4 +1,4 @@
-"""The doctor's findings and conclusion, and how they are displayed.
+"""The doctor's findings and conclusion, and functions to format them.
 
 This module has no side effects.
 """
@@ -23,7 +23,7 @@ _STATE_WIDTH_CHARS, _CHECK_WIDTH_CHARS = 7, 12
 _MESSAGE_INDENT = " " * (_STATE_WIDTH_CHARS + _CHECK_WIDTH_CHARS + 2 * len(COLUMN_GAP))
 _ARROW = "-> "
 _FINAL_STEP_INDENT = "  "
-#: For each state of a finding, the goal state whose colour is used to display it.
+#: For each state of a finding, the goal state with the same colour.
 _FINDING_COLOURS = {OK: State.SUCCEEDED, WARNING: State.PREEMPTED, FAILURE: State.ABORTED}
 
 
@@ -35,7 +35,7 @@ class Finding:
     check: str
     #: OK, WARNING or FAILURE
     state: str
-    #: human-readable description, in which text from other programs is escaped
+    #: human-readable description, with text from other programs escaped
     message: str
     #: what the user should do next, or None if nothing is wrong
     next: str | None = None
@@ -43,7 +43,7 @@ class Finding:
 
 @frozen
 class Question:
-    """A question that an examination answers, given as the text of each answer."""
+    """The question that an examination answers, with all possible answers."""
 
     #: the human-readable answers
     yes: str
@@ -59,22 +59,28 @@ BRIDGE_QUESTION = Question("the broker accepts this robot's messages", "the brok
 
 
 def ok(check: str, message: str) -> Finding:
-    """Return the finding of a check that found no fault."""
+    """Return a finding for a check that passed."""
     return Finding(check, OK, printable(message))
 
 
 def warning(check: str, message: str, step: str) -> Finding:
-    """Return a finding about a fault that may prevent sound. `step` is what the user should do next."""
+    """Return a finding about a fault that may prevent sound.
+
+    `step` is what the user should do next.
+    """
     return Finding(check, WARNING, printable(message), printable(step))
 
 
 def failure(check: str, message: str, step: str) -> Finding:
-    """Return a finding about a fault that certainly prevents sound. `step` is what the user should do next."""
+    """Return a finding about a fault that certainly prevents sound.
+
+    `step` is what the user should do next.
+    """
     return Finding(check, FAILURE, printable(message), printable(step))
 
 
 def join_names(names: Sequence[str]) -> str:
-    """Join names with commas. If there are many, show only the first four."""
+    """Join names with commas, and shorten long lists."""
     hidden = len(names) - _SHOWN_NAMES_COUNT
     return ", ".join(names) if hidden <= 1 else f"{', '.join(names[:_SHOWN_NAMES_COUNT])} and {hidden} more"
 
@@ -115,7 +121,10 @@ def format_conclusion(findings: Sequence[Finding], screen: Screen, question: Que
 
 
 def _wrap(text: str, room: int | None) -> list[str]:
-    """Split a text into lines of at most `room` characters. If `room` is None, return a single line."""
+    """Split a text into lines of at most `room` characters.
+
+    If `room` is None, return a single line.
+    """
     if room is None:
         return [text]
     # Don't break words at hyphens, because users copy paths and commands.

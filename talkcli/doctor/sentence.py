@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import Goal
 
 _SENTENCE_CHECK = "sentence"
-#: The sentence that is played silently beside a running server. It is short and fast, because some devices accept only
-#: one player at a time, but long enough to show whether the player works.
+#: The sentence to play silently beside a running server. It is short, because some devices accept only one player at a
+#: time, but long enough to show whether the player works.
 SILENT_TEXT, _SILENT_RATE_WPM = "talk works well", 450
 #: Advice for each reason why a goal can end. The reasons "late" and "paused" are only used by the doctor. A test checks
 #: that no reason for aborting a goal is missing.
@@ -57,10 +57,12 @@ ADVICE: dict[str, str] = {
 SENTENCE_ELSEWHERE = failure(
     _SENTENCE_CHECK,
     "not played: the server and its player run on another machine or in a container",
-    "run talk doctor --silent there, or run it here without --silent, so that the server plays",
+    "run 'talk doctor --silent' there, or run 'talk doctor' here, so that the server plays a sentence",
 )
 #: Advice if the player of another user's server failed. The doctor can't use that server's environment.
-RUN_AS_OWNER = "run it as the server's user, whose sound settings may differ: sudo -u '#{}' talk doctor --silent"
+RUN_AS_OWNER = (
+    "run talk doctor as the server's user, whose sound settings may differ: sudo -u '#{}' talk doctor --silent"
+)
 _BUSY_STEP = "another program uses the device: close it, or play through a sound server (PipeWire, PulseAudio)"
 _PLAYER_REASONS = {Reason.AUDIO_DEVICE, Reason.AUDIO_LOST, Reason.AUDIO_STALLED}
 _START_REASONS = {Reason.ENGINE_FAILED, Reason.ENGINE_HUNG}
@@ -90,7 +92,10 @@ class SentenceResult:
 
 
 def speak_by_server(client: Client, text: str, limit: float) -> SentenceResult:
-    """Speak a sentence through the server, and return how it ended. Cancel it after `limit` seconds."""
+    """Speak a sentence through the server, and return how it ended.
+
+    Cancel it after `limit` seconds.
+    """
     try:
         goal = client.say(text, preempt=False, ttl=0)
         try:
@@ -110,7 +115,7 @@ def speak_by_server(client: Client, text: str, limit: float) -> SentenceResult:
 
 
 def _cancel_late_goal(client: Client, goal: GoalHandle, limit: float) -> SentenceResult:
-    """Cancel a goal that took longer than `limit` seconds, and return a result that explains the delay."""
+    """Cancel a goal that took too long, and explain the delay."""
     before = client.status()
     ended = goal.cancel()
     if ended.state in {State.SUCCEEDED, State.ABORTED}:  # it ended before it could be cancelled
@@ -119,7 +124,9 @@ def _cancel_late_goal(client: Client, goal: GoalHandle, limit: float) -> Sentenc
     if before.server.get("paused") is True:
         return SentenceResult(ended.state, "paused", "not spoken: speech is paused")
     if goal.id not in pending:
-        return SentenceResult(ended.state, "late", f"cancelled, because it had not ended after {limit:g} s")
+        return SentenceResult(
+            ended.state, "late", f"the sentence was cancelled, because it had not ended after {limit:g} s"
+        )
     ahead = pending.index(goal.id) + bool(before.active)
     goals = "1 goal" if ahead == 1 else f"{ahead} goals"
     return SentenceResult(ended.state, "late", f"not spoken: it was still waiting behind {goals} after {limit:g} s")
@@ -132,7 +139,10 @@ def _goal_result(goal: Goal) -> SentenceResult:
 
 
 def speak_beside_server(client: Client, options: EngineOptions, limit: float) -> SentenceResult:
-    """Play a silent sentence with the doctor's own engine. Return how it ended, and whether the server spoke."""
+    """Play a silent sentence with the doctor's own engine.
+
+    Return how it ended, and whether the server also spoke.
+    """
     try:
         before = client.status()
         result = speak_by_engine(SILENT_TEXT, options, 0.0, limit)
@@ -145,7 +155,10 @@ def speak_beside_server(client: Client, options: EngineOptions, limit: float) ->
 
 
 def speak_by_engine(text: str, options: EngineOptions, volume: float, limit: float) -> SentenceResult:
-    """Speak a sentence with the doctor's own engine, and return how it ended. Give up after `limit` seconds."""
+    """Speak a sentence with the doctor's own engine, and return how it ended.
+
+    Give up after `limit` seconds.
+    """
     try:
         with start_engine(options, limit) as engine:
             player = engine.wait_for(protocol.Ready).player
@@ -158,11 +171,11 @@ def speak_by_engine(text: str, options: EngineOptions, volume: float, limit: flo
     except EngineFailed as error:
         return SentenceResult(State.ABORTED, *explain_failure(error))
     except TimeoutError:
-        return SentenceResult(State.ABORTED, Reason.ENGINE_HUNG, f"it did not end within {limit:g} s")
+        return SentenceResult(State.ABORTED, Reason.ENGINE_HUNG, f"the sentence did not end within {limit:g} s")
 
 
 def find_playback_step(findings: Sequence[Finding], *, custom: bool = False) -> str | None:
-    """Return advice for the most likely cause of a playback fault, or None if no cause was found.
+    """Return advice for the most likely cause of a playback fault.
 
     Args:
         findings: the findings of all checks before the sentence.
@@ -176,7 +189,7 @@ def find_playback_step(findings: Sequence[Finding], *, custom: bool = False) -> 
 def advise(
     reason: str | None, message: str | None, player: object = None, device: object = None, text: str | None = None
 ) -> str:
-    """Return what the user should do next if a goal ended for this reason.
+    """Return advice for a goal that ended for this reason.
 
     Args:
         reason: the goal's reason.
@@ -192,7 +205,7 @@ def advise(
     if reason == Reason.AUDIO_DEVICE and "busy" in said:
         return _BUSY_STEP
     if reason == Reason.AUDIO_DEVICE and ("denied" in said or "not permitted" in said):
-        return "for the server's user: sudo usermod -aG audio USER; then log in again, and restart the server"
+        return "give the server's user access: sudo usermod -aG audio USER; then log in again, and restart the server"
     if reason == Reason.NO_PLAYER and player == "pulse":
         return "start PulseAudio or PipeWire, or use ALSA: talk serve --player aplay"
     if reason == Reason.ENGINE_FAILED and "libespeak-ng is missing" in message:
@@ -200,7 +213,7 @@ def advise(
     if reason in _PLAYER_REASONS and isinstance(player, str) and is_custom(player):
         command = player.replace("{rate}", "22050").replace("{device}", str(device or "default"))
         return f"test the player with a second of silence: head -c 44100 /dev/zero | {command}"
-    return ADVICE.get(reason or "", "another client ended it: run talk doctor again")
+    return ADVICE.get(reason or "", "another client ended the sentence: run talk doctor again")
 
 
 def judge_sentence(
@@ -217,12 +230,14 @@ def judge_sentence(
     """
     if result.state is State.SUCCEEDED and result.muted_device:
         step = ADVICE[Reason.MUTED].replace("@DEFAULT_SINK@", result.muted_device)
-        return failure(_SENTENCE_CHECK, f"it was played, but the output {result.muted_device} was muted", step)
+        return failure(
+            _SENTENCE_CHECK, f"the sentence was played, but the output {result.muted_device} was muted", step
+        )
     if result.state is State.SUCCEEDED:
         how = "through the server" if result.by_server else "by talk doctor's own engine"
         seconds = "" if result.duration is None else f", {result.duration:.1f} s"
         player = f", {result.player}" if result.player else ""
-        said = "a sentence was played without sound" if silent else f'"{SENTENCE_TEXT}" was played to its end'
+        said = "a sentence was played without sound" if silent else f'"{SENTENCE_TEXT}" was played to the end'
         return ok(_SENTENCE_CHECK, f"{said} {how}{player}{seconds}")
     if result.reason in {"late", "paused"}:
         return failure(_SENTENCE_CHECK, result.message or "", ADVICE[result.reason])

@@ -33,29 +33,28 @@ if TYPE_CHECKING:
 
 #: The name under which the doctor connects to the server.
 DOCTOR_NAME = "talk doctor"
-#: The beginning of a client's error message that only lists the places where no server was found.
+#: How a client's error message begins if no server was found.
 _NO_SERVER_PREFIX = "no server"
 #: Number of recently ended goals to check for failures.
 _LOG_GOALS_COUNT = 100
 _RECENT_CHECK = "recent goals"
 #: How long to wait for a starting engine, and how often to ask for its state.
 _ENGINE_START_LIMIT_S, _ENGINE_POLL_S = 1.0, 0.05
-#: Descriptions of paths to which a client can connect. The kernel accepts connections even if the process never
-#: answers. `paths` describes failed connections.
+#: Descriptions of paths that accept connections. The kernel accepts them even if the process never answers.
 PLACE_FOREIGN = "another user's server"
 PLACE_LISTENING = "a process is listening"
 PLACE_STOPPED = "a stopped process is listening"
 #: Advice if the server refuses the client, by error code.
 _REFUSAL_ADVICE = {
     "protocol_mismatch": "install the same version of talk for the server and its clients, and restart the server",
-    "busy": "end some of its clients, or raise the limit in the message: talk serve --max-clients 512, or LimitNOFILE=",
+    "busy": "end some clients, or raise the limit named above: talk serve --max-clients 512, or LimitNOFILE=",
     "permission_denied": "ask its owner for access: talk serve --socket-mode 0660, and join the socket's group",
 }
 #: Advice for each kind of place. If several kinds were found, the first one in this table counts.
 _PLACE_ADVICE = {
     PLACE_FORBIDDEN: "ask {whose} for access: talk serve --socket-mode 0660, and join the socket's group; "
     "or start your own server",
-    PLACE_FOREIGN: "remove it, and run: talk serve; or if you trust uid {uid}, run: talk --socket {path} doctor",
+    PLACE_FOREIGN: "remove {path}, and run: talk serve; or if you trust uid {uid}, run: talk --socket {path} doctor",
     PLACE_STOPPED: "continue the process: kill -CONT {pid}",
     PLACE_LISTENING: "restart the server on {path}; if the socket isn't talk's, remove it",
     PLACE_FILE: "remove {path}, and run: talk serve",
@@ -71,10 +70,10 @@ _FAINT_VOLUME = 0.2
 
 @frozen
 class SocketPlace:
-    """A path where a server may listen, and what is there."""
+    """What was found at a path where a server may listen."""
 
     path: str
-    #: what is there: one of the PLACE texts, or the system's error message
+    #: one of the PLACE texts, or the system's error message
     what: str
     #: owner of the process or the file, or None if unknown
     uid: int | None = None
@@ -83,7 +82,9 @@ class SocketPlace:
 
 
 def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Client | None, Finding]:
-    """Connect to the server. Return the client, or None, and the finding about the server's socket.
+    """Connect to the server.
+
+    Return the client, if connected, and the finding about the server's socket.
 
     The client is None if no connection was possible.
 
@@ -106,7 +107,7 @@ def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Cl
 
 
 def _find_refusal(error: TalkError, places: list[SocketPlace]) -> str | None:
-    """Return the line of an error message that says why a process refused the client, or None."""
+    """Find the line of an error message that says why the client was refused."""
     lines = error.message.splitlines()
     if not lines[0].startswith(_NO_SERVER_PREFIX):
         return lines[0]
@@ -115,7 +116,7 @@ def _find_refusal(error: TalkError, places: list[SocketPlace]) -> str | None:
 
 
 def _probe_path(path: str, trusted: Container[str | None]) -> SocketPlace:
-    """Connect to a path, disconnect at once, and return what is there."""
+    """Find out what is at a path by connecting to it."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
@@ -134,7 +135,7 @@ def _probe_path(path: str, trusted: Container[str | None]) -> SocketPlace:
 
 
 def request_status_and_log(client: Client) -> tuple[JsonObject, list[Goal]]:
-    """Request and return a server's status and its recently ended goals, oldest first.
+    """Return a server's status and its recently ended goals, oldest first.
 
     If the server has just started, wait a moment until its engine has reported the player.
     """
@@ -147,7 +148,7 @@ def request_status_and_log(client: Client) -> tuple[JsonObject, list[Goal]]:
 
 
 def local_pid(client: Client) -> int | None:
-    """Return the server's process id, or None if the server runs on another machine.
+    """Return the server's process id, or None if the server runs elsewhere.
 
     The server's socket may be forwarded by ssh, for example.
 
@@ -159,7 +160,7 @@ def local_pid(client: Client) -> int | None:
 
 
 def judge_found_server(message: str, earlier_places: list[SocketPlace]) -> Finding:
-    """Return the finding about the server's socket, and about anything at the places that clients try first.
+    """Return the finding about the socket of the server that was found.
 
     Args:
         message: the description of the server's socket.
@@ -189,16 +190,19 @@ def explain_missing_server(places: list[SocketPlace], named_by: str | None, erro
 
 
 def _format_place(place: SocketPlace) -> str:
-    """Format a path and what was found there as words of a message."""
+    """Describe a path and what was found there."""
     whose = "" if place.uid is None or place.what not in {PLACE_FOREIGN, PLACE_FORBIDDEN} else f" (uid {place.uid})"
     return f"{place.path}: {place.what}{whose}"
 
 
 def _advise_on_missing_server(places: list[SocketPlace], named_by: str | None, code: str) -> str:
-    """Return advice for a user whose server wasn't found. `code` is the code of the client's error."""
+    """Return advice for a user whose server wasn't found.
+
+    `code` is the code of the client's error.
+    """
     for each in paths.client_sockets(None) if named_by else []:
         if _probe_path(each, set()).what == PLACE_LISTENING:
-            return f"{_UNNAMING[named_by]}: a server is running on {each}"
+            return f"{_UNNAMING[named_by]}, because a server is running on {each}"
     place = next((each for what in _PLACE_ADVICE for each in places if each.what == what), None)
     if place is None:  # a new server could start at any of the places
         # Only root can see the sockets of all users.
@@ -220,12 +224,12 @@ def _advise_on_missing_server(places: list[SocketPlace], named_by: str | None, c
 
 
 def judge_unresponsive_server(message: str) -> Finding:
-    """Return the finding about a server that accepted the connection, but didn't answer."""
+    """Return the finding about a server that accepted the connection but didn't answer."""
     return failure("server", message, "read its log, and restart it: talk serve")
 
 
 def judge_server(server: JsonObject, log: Sequence[Goal], now: float) -> list[Finding]:
-    """Return the findings about the server's state and settings, and about recent failures.
+    """Return the findings about the server's state, settings and recent failures.
 
     Args:
         server: the server's description of itself.
@@ -236,7 +240,7 @@ def judge_server(server: JsonObject, log: Sequence[Goal], now: float) -> list[Fi
 
 
 def _judge_state(server: JsonObject) -> Finding:
-    """Return the finding about whether a server is paused, its engine works, and its version is the installed one."""
+    """Return the finding about a server's state."""
     version, words = server.get("version"), summarize_server(server)
     if server.get("paused") is True:
         return failure("server", f"speech is paused; {words}", "talk resume")
@@ -258,7 +262,10 @@ def summarize_server(server: JsonObject) -> str:
 
 
 def _judge_settings(server: JsonObject) -> Finding:
-    """Return the finding about a server's settings. It is not ok if the volume is too low."""
+    """Return the finding about a server's settings.
+
+    It is a warning or failure if the volume is too low.
+    """
     volume = server.get("volume")
     lead_in = [f"lead-in {server['lead_in']} ms"] if server.get("lead_in") else []
     words = ", ".join([*describe_settings(server), *lead_in])
@@ -269,7 +276,10 @@ def _judge_settings(server: JsonObject) -> Finding:
 
 
 def _judge_recent(goals: Sequence[Goal], now: float, server: JsonObject) -> Finding:
-    """Return the finding about recent goals. It is a warning if no goal has succeeded since the last failure."""
+    """Return the finding about recent goals.
+
+    It is a warning if no goal has succeeded since the last failure.
+    """
     if not goals:
         return ok(_RECENT_CHECK, "no goals yet")
     aborted = [each for each in goals if each.state is State.ABORTED]
@@ -289,7 +299,10 @@ def _judge_recent(goals: Sequence[Goal], now: float, server: JsonObject) -> Find
 
 
 def format_span(seconds: object) -> str:
-    """Format a duration in a suitable unit, such as "3 min". Return "?" if it isn't a number."""
+    """Format a duration in a suitable unit, such as "3 min".
+
+    Return "?" if it isn't a number.
+    """
     if not isinstance(seconds, int | float):
         return "?"
     for unit, length in (("d", 86400), ("h", 3600), ("min", 60)):

@@ -58,7 +58,7 @@ _FAINT_PERCENT = 20
 _ALSA_CONTROLS = ("Master", "PCM", "Speaker", "Headphone", "Digital")
 #: The human-readable name of a sound server's output.
 _DEFAULT_SINK = "the default sink"
-#: The commands of each mixer program that unmute the default sink and make it louder.
+#: For each mixer program, the commands that unmute the default sink and raise its volume.
 _PACTL_COMMANDS = ("pactl set-sink-mute @DEFAULT_SINK@ 0", "pactl set-sink-volume @DEFAULT_SINK@ 70%")
 _WPCTL_COMMANDS = ("wpctl set-mute @DEFAULT_AUDIO_SINK@ 0", "wpctl set-volume @DEFAULT_AUDIO_SINK@ 0.7")
 #: Time limit for a program. Programs answer within milliseconds, unless the sound server hangs.
@@ -69,7 +69,7 @@ _MAX_OUTPUT_BYTES = 64 * 1024
 
 @frozen
 class UserSession:
-    """The user and session of a process, which is the server or this process."""
+    """The user and session of a process."""
 
     uid: int
     user: str
@@ -91,7 +91,7 @@ class UserSession:
 
 @frozen
 class ProgramOutput:
-    """A program's output, and the reason if it failed."""
+    """A program's output, with the reason if it failed."""
 
     #: why the program failed, or None if it succeeded
     error: str | None
@@ -101,7 +101,7 @@ class ProgramOutput:
 
 @frozen
 class SoundServer:
-    """Facts about the sound server, which is PulseAudio or PipeWire."""
+    """Facts about the sound server (PulseAudio or PipeWire)."""
 
     #: name such as "PulseAudio (on PipeWire 0.3.65)", or None if no sound server answers
     name: str | None = None
@@ -120,7 +120,7 @@ class SoundServer:
 
 
 def find_session(server_pid: int | None) -> tuple[UserSession, Mapping[str, str]]:
-    """Return the session and environment of the process whose player makes the sound.
+    """Return the session and environment of the process that plays the sound.
 
     This is the server, or this process if there is no server or its environment can't be read.
     """
@@ -172,7 +172,10 @@ def _read_environment(pid: int) -> dict[str, str] | None:
 
 
 def _name_or_id(look_up: Callable[[int], tuple[Any, ...]], number: int) -> str:
-    """Return the name of a user or group, or the id if it has no name. `look_up` is `getpwuid` or `getgrgid`."""
+    """Return the name of a user or group, or the id if it has no name.
+
+    `look_up` is `getpwuid` or `getgrgid`.
+    """
     try:
         return str(look_up(number)[0])
     except KeyError:
@@ -188,7 +191,7 @@ def _group_ids(pid: int) -> tuple[int, ...]:
 
 
 def _find_origins(environment: Mapping[str, str], pid: int) -> Iterable[str]:
-    """Yield descriptions of what started a process, with the most specific one first."""
+    """Yield descriptions of what started a process, most specific first."""
     if environment.get("container") or any(map(os.path.exists, _CONTAINER_FILES)):
         yield _CONTAINER
     unit = re.search(r"system\.slice/(?:[^\n]*/)?([^/\n]+)\.service", _read_proc_text(f"/proc/{pid}/cgroup"))
@@ -242,7 +245,7 @@ def _read_proc_text(path: str) -> str:
 
 
 def run_program(program: str, *arguments: str, env: Mapping[str, str], limit: float | None = None) -> ProgramOutput:
-    """Run a program in the C locale, and return its output. Kill it after `limit` seconds.
+    """Run a program in the C locale with a time limit, and return its output.
 
     The default limit is PROGRAM_LIMIT_S.
     """
@@ -264,7 +267,7 @@ def run_program(program: str, *arguments: str, env: Mapping[str, str], limit: fl
             process.wait(limit)
         code = process.returncode
         if code is None:
-            kill([-process.pid])  # the process group, whose id can't be reused before the process is reaped
+            kill([-process.pid])  # the group's id stays valid until the process is reaped
             with contextlib.suppress(subprocess.TimeoutExpired):  # it hangs in a driver, so init will reap it
                 process.wait(1)
         stdout, stderr = (os.pread(each.fileno(), _MAX_OUTPUT_BYTES, 0).decode(errors="replace") for each in (out, err))
@@ -277,7 +280,7 @@ def run_program(program: str, *arguments: str, env: Mapping[str, str], limit: fl
 
 
 def is_custom(player: str | None) -> bool:
-    """Return whether a player is a command that the user wrote, not one of the known players."""
+    """Return whether a player is a command that the user wrote."""
     program = _program_of(player) if player and not is_silent(player) else None
     return program is not None and program.rpartition("/")[2] not in PLAYERS
 
@@ -296,12 +299,12 @@ def installed_players(env: Mapping[str, str]) -> list[str]:
 
 
 def _parse_alsa_devices(output: ProgramOutput) -> list[str]:
-    """Return the names in the device list of `aplay -L`, without ALSA's plugins and converters."""
+    """Return the devices listed by `aplay -L`, except plugins and converters."""
     return [each for each in output.stdout.splitlines() if each and not each[0].isspace() and each not in _NOT_DEVICES]
 
 
 def _parse_pulse_sinks(output: ProgramOutput) -> dict[str, str]:
-    """Parse the list of sinks printed by pactl, and return the state of each sink by name.
+    """Return the state of each sink in pactl's list, by name.
 
     A line has the sink's number, name, module, format and state, separated by tabs.
     """
@@ -310,7 +313,7 @@ def _parse_pulse_sinks(output: ProgramOutput) -> dict[str, str]:
 
 
 def _parse_pipewire_sinks(output: ProgramOutput) -> list[str]:
-    """Return the names of the sinks in the list of nodes printed by `pw-cli ls Node`."""
+    """Return the names of the sinks listed by `pw-cli ls Node`."""
     nodes = re.split(r"^\s*id \d+,", output.stdout, flags=re.MULTILINE)
     found = [re.search(r'node\.name = "([^"]*)"', each) for each in nodes if '"Audio/Sink"' in each]
     return [each[1] for each in found if each]
@@ -327,20 +330,20 @@ DEVICE_LISTS: dict[str, tuple[str, Callable[[ProgramOutput], Iterable[str]], str
 
 
 def add_pactl_hint(finding: Finding, env: Mapping[str, str]) -> Finding:
-    """Return a finding, with a hint on how to install pactl if its advice uses pactl and pactl is missing."""
+    """Add a hint on how to install pactl if the advice needs it and it is missing."""
     if finding.next is None or "pactl " not in finding.next or on_path("pactl", env):
         return finding
     return replace(finding, next=f"{finding.next} (to install pactl: sudo apt-get install -y {PACKAGES['pacat']})")
 
 
 def suspended_sinks(env: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the names of suspended sinks, including sinks that are only suspended because nothing is playing."""
+    """Return the names of suspended sinks, including idle ones."""
     sinks = _parse_pulse_sinks(run_program(*_LIST_SINKS.split(), env=env))
     return tuple(name for name, state in sinks.items() if state == "SUSPENDED")
 
 
 def find_sound_server(env: Mapping[str, str], session: UserSession) -> SoundServer:
-    """Find out which sound server the players of this session connect to, or why none answers."""
+    """Find the sound server that the session's players connect to."""
     pulse = run_program("pactl", "info", env=env)
     if pulse.error is None:
         fields = dict(re.findall(r"^\s*([\w ]+): (.*\S)", pulse.stdout, re.MULTILINE))
@@ -377,7 +380,7 @@ def _find_pulse_address(env: Mapping[str, str]) -> str | None:
 
 
 def check_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[str], *, is_used: bool) -> list[Finding]:
-    """Return the findings about the volume of the default sink, or of the sound cards if there is no sound server.
+    """Check the volume of the default sink or, without a sound server, of the sound cards.
 
     Args:
         env: the environment of the player.
@@ -393,7 +396,7 @@ def check_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[st
 
 
 def _read_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[str]) -> Iterable[tuple[str, ...]]:
-    """Run mixer programs, and yield the first four arguments of `judge_level` for each output."""
+    """Yield arguments of `judge_level` for each output."""
     if server.name is not None:
         mute = run_program("pactl", "get-sink-mute", "@DEFAULT_SINK@", env=env)
         if mute.error is None:
@@ -412,7 +415,9 @@ def _read_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[st
 
 
 def judge_level(name: str, text: str, unmute_command: str, louder_command: str, *, is_used: bool) -> Finding:
-    """Return the finding about the volume of one output. If its channels differ, the loudest one counts.
+    """Return the finding about the volume of one output.
+
+    If its channels differ, the loudest one counts.
 
     Args:
         name: the name of the sink or the mixer control.
@@ -439,7 +444,7 @@ def judge_level(name: str, text: str, unmute_command: str, louder_command: str, 
 
 
 def judge_session(session: UserSession) -> Finding:
-    """Return the finding about the session, which shows whether players can find the user's sound server."""
+    """Return the finding about the user session."""
     who = "" if session.server_pid is None else "the server runs as "
     who += f"user {session.user} (uid {session.uid})"
     who += "" if session.sudo_uid is None else f" through sudo by uid {session.sudo_uid}"
@@ -447,7 +452,7 @@ def judge_session(session: UserSession) -> Finding:
     if session.runtime_dir is None:
         if session.usual_runtime_dir is None:
             # This is normal on robots without logind, which would create the directory.
-            return ok("session", f"{who}; no XDG_RUNTIME_DIR, because this user has no login session")
+            return ok("session", f"{who}; XDG_RUNTIME_DIR is not set, because this user has no login session")
         again = "" if session.server_pid is None else " for the server, and restart it"
         return warning(
             "session",
@@ -460,7 +465,7 @@ def judge_session(session: UserSession) -> Finding:
         step = "log in as this user (without su or sudo), or unset XDG_RUNTIME_DIR"
         return warning("session", f"{words}, which does not exist", step)
     if session.runtime_owner != session.uid:
-        step = f"run this as the user who owns it: sudo -u '#{session.runtime_owner}' talk doctor"
+        step = f"run talk doctor as the directory's owner: sudo -u '#{session.runtime_owner}' talk doctor"
         words = f"{words}, which belongs to uid {session.runtime_owner}, whose sound server accepts no other user"
         return warning("session", words, step)
     return ok("session", words)
@@ -473,12 +478,12 @@ def judge_silent_player(player: str | None, *, by_server: bool) -> Finding:
 
 
 def _describe_player_setting(by_server: bool) -> str:
-    """Return words that say whether the server or TALK_PLAYER configured the player."""
+    """Describe where the player was configured."""
     return "set by the server" if by_server else "set by TALK_PLAYER"
 
 
 def check_player(env: Mapping[str, str], configured: str | None, used: str | None, *, by_server: bool) -> Finding:
-    """Check whether the player is installed, and return the finding.
+    """Check whether the player is installed.
 
     Args:
         env: the environment of the player.
@@ -490,7 +495,9 @@ def check_player(env: Mapping[str, str], configured: str | None, used: str | Non
     broken = warning if by_server else failure
     if used is None:
         package = next(iter(PACKAGES.values()))
-        return broken("player", f"none is on the PATH ({', '.join(PACKAGES)})", f"sudo apt-get install -y {package}")
+        return broken(
+            "player", f"no player is on the PATH ({', '.join(PACKAGES)})", f"sudo apt-get install -y {package}"
+        )
     if configured is None:
         how = " to play through the sound server" if used == "pulse" else ""
         return ok("player", f"{used} is used{how}" + (f"; other players: {', '.join(others)}" if others else ""))
@@ -505,7 +512,7 @@ def check_player(env: Mapping[str, str], configured: str | None, used: str | Non
 
 
 def check_device(env: Mapping[str, str], player: str, configured: str | None) -> Finding:
-    """List the player's devices, and return the finding about whether the configured one is among them.
+    """Check whether the configured device is one of the player's devices.
 
     Args:
         env: the environment of the player.
@@ -531,26 +538,26 @@ def check_device(env: Mapping[str, str], player: str, configured: str | None) ->
     # A device such as plughw:1,0 may work even if ALSA doesn't list it. The sentence will show whether it does.
     if configured is None or configured in names or ":" in configured:
         return ok("device", f"{used}; {command} lists {join_names(names)}")
-    words = f"{configured} is not in the list of {command}: {join_names(names)}"
+    words = f"{configured} is not a device that {command} lists: {join_names(names)}"
     return warning("device", words, "restart the server with --device and one of these names")
 
 
 def check_cards(cards: Sequence[str], server: SoundServer, session: UserSession) -> Finding:
-    """Return the finding about whether the kernel has found sound cards."""
+    """Check whether the kernel has found any sound cards."""
     if cards:
         return ok("cards", join_names(cards))
     if server.name is not None:
-        return ok("cards", "this machine has none, but the sound server has an output")
+        return ok("cards", "this machine has no sound card, but the sound server has an output")
     if _CONTAINER in session.origins:
         step = "start the container with --device /dev/snd, or with the sound server's socket (see the README)"
-        return warning("cards", "this container has none", step)
+        return warning("cards", "this container has no sound card", step)
     has_sound = os.path.isdir(_KERNEL_SOUND)
-    words = "the kernel found none" if has_sound else f"the kernel has no sound support (no {_KERNEL_SOUND})"
+    words = "the kernel found no sound card" if has_sound else f"the kernel has no sound support (no {_KERNEL_SOUND})"
     return warning("cards", words, "connect a loudspeaker or a sound card, and check with: aplay -l")
 
 
 def check_access(server: SoundServer, session: UserSession, directory: str = "/dev/snd") -> Finding:
-    """Check whether the user may open the sound cards, and return the finding."""
+    """Check whether the user may open the sound cards."""
     nodes, group, forbidden = players.playback_devices(directory), _AUDIO_GROUP, []
     for each in nodes:
         with contextlib.suppress(OSError):
@@ -575,7 +582,7 @@ def check_access(server: SoundServer, session: UserSession, directory: str = "/d
 
 
 def judge_sound_server(server: SoundServer, cards: Sequence[str], session: UserSession) -> Finding:
-    """Return the finding about the sound server, which shows whether players can use it."""
+    """Return the finding about the sound server."""
     check = _SOUND_SERVER_CHECK
     where = "from here" if session.server_pid is None else f"from the server (process {session.server_pid})"
     if server.name is not None and server.sink == DUMMY_SINK:
@@ -594,12 +601,12 @@ def judge_sound_server(server: SoundServer, cards: Sequence[str], session: UserS
     at = f"{server.pulse_server} (PULSE_SERVER)" if server.pulse_server else join_names(server.sockets)
     if server.error is None:
         step = "sudo apt-get install -y pulseaudio-utils"
-        return warning(check, f"found one at {at}, but no program to check it (pactl or pw-cli)", step)
+        return warning(check, f"found a sound server at {at}, but no program to check it (pactl or pw-cli)", step)
     return _judge_unreachable(server, session, f"the sound server at {at} cannot be reached {where}: {server.error}")
 
 
 def _judge_unreachable(server: SoundServer, session: UserSession, message: str) -> Finding:
-    """Return a warning that the sound server can't be reached, with advice for the most likely cause."""
+    """Return a warning that the sound server can't be reached."""
     hint, step = "", "systemctl --user restart pipewire pipewire-pulse (or: pulseaudio --start)"
     if server.pulse_server is not None:
         step = "unset PULSE_SERVER, or start the sound server that it names"
@@ -611,7 +618,7 @@ def _judge_unreachable(server: SoundServer, session: UserSession, message: str) 
         step = "run the server as a service of your user: talk serve --print-unit user"
     elif session.sudo_uid is not None:
         hint = "; a sound server accepts only its own user, not root"
-        step = "run this without sudo, as the user of the sound server"
+        step = "run talk doctor without sudo, as the user of the sound server"
     elif session.runtime_dir is None and session.usual_runtime_dir is not None:
         step = f"export XDG_RUNTIME_DIR={session.usual_runtime_dir}"
     return warning(_SOUND_SERVER_CHECK, message + hint, step)

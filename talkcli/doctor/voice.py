@@ -112,14 +112,14 @@ class VoiceTrial:
 
 
 def installed_version(package: str) -> str | None:
-    """Return the version of a package without importing it, or None if it is not installed."""
+    """Return the version of a package without importing it."""
     with contextlib.suppress(PackageNotFoundError):
         return version(package)
     return None
 
 
 def start_engine(options: EngineOptions, limit: float = math.inf, output: int | None = None) -> PrivateEngine:
-    """Start an engine process, and return it.
+    """Start an engine process.
 
     Args:
         options: the options of the engine.
@@ -136,7 +136,7 @@ def start_engine(options: EngineOptions, limit: float = math.inf, output: int | 
 
 
 def probe_engine(options: EngineOptions) -> EngineReport:
-    """Start an engine process, end it, and return what it reported."""
+    """Start and end an engine process, and return its report."""
     ready = None
     try:
         with start_engine(options) as engine:
@@ -208,7 +208,7 @@ def _judge_library(library_version: str | None, voices: tuple[str, ...] | None) 
 def check_neural(
     used: str | None, options: EngineOptions, limit: float, server_voices: dict[str, Any] | None
 ) -> Iterator[Finding]:
-    """Check the packages and files of neural voices, try the voice in use, and yield the findings.
+    """Check the installation of neural voices, and try the voice in use.
 
     Args:
         used: the voice in use, as the user wrote it, or None if no neural voice is in use.
@@ -229,7 +229,7 @@ def check_neural(
 
 
 def _check_voice_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
-    """Check the files of all installed neural voices, and yield a finding if there are any."""
+    """Check the files of all installed neural voices."""
     valid, invalid = [], []
     for name, path in models.find_models(env).items():
         try:
@@ -245,17 +245,20 @@ def _check_voice_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
         more = f"; also faulty: {names}" if others else ""
         yield warning(_FILES_CHECK, f"{voice}: {message}{more}", step)
     elif valid:
-        yield ok(_FILES_CHECK, f"complete and safe: {join_names(valid)}")
+        yield ok(_FILES_CHECK, f"the files of {join_names(valid)} are complete and safe")
 
 
 def _find_package_fault(env: Mapping[str, str]) -> tuple[str, str] | None:
-    """Test the packages of neural voices. Return an error message and advice, or None if they can be imported."""
+    """Test the packages of neural voices.
+
+    Return an error message and advice, or None if they can be imported.
+    """
     missing = models.missing_package()
     if missing is not None:
         return _split_advice(missing)
     env = {**env, **models.PACKAGE_VARIABLES}
     fault = None
-    for package in install.NEURAL_PACKAGES:  # the first one imports numpy, which may be the one that doesn't work
+    for package in install.NEURAL_PACKAGES:  # the first package imports numpy, which may be the faulty one
         output = run_program(sys.executable, "-c", _IMPORT_PROGRAM + package, env=env, limit=_IMPORT_LIMIT_S)
         if output.error is None:
             break
@@ -271,7 +274,7 @@ def _with_version(package: str) -> str:
 
 
 def _split_advice(message: str) -> tuple[str, str]:
-    """Split an error message into the fault and the advice, which follows the last semicolon.
+    """Split an error message into the fault and the advice.
 
     The default advice is to choose another voice.
     """
@@ -280,7 +283,10 @@ def _split_advice(message: str) -> tuple[str, str]:
 
 
 def _try_voice(voice: str, options: EngineOptions, limit: float) -> VoiceTrial:
-    """Load a voice, and return how fast it speaks a sentence, or why it failed. Nothing is played."""
+    """Load a voice, and measure how fast it speaks.
+
+    Nothing is played.
+    """
     try:
         with open(os.devnull, "wb") as output, start_engine(options, limit, output.fileno()) as engine:
             engine.wait_for(protocol.Ready)
@@ -299,9 +305,9 @@ def _try_voice(voice: str, options: EngineOptions, limit: float) -> VoiceTrial:
 
 
 def _speak(engine: PrivateEngine, voice: str, text: str) -> tuple[protocol.Ended, float | None]:
-    """Speak a text. Return how it ended, and the seconds it took to load the voice.
+    """Speak a text, and return how it ended.
 
-    The loading time is None if the voice was not loaded during this call.
+    Also return the voice's loading time, or None if it was already loaded.
     """
     load_s = None
     # Set `voice_only`, because otherwise espeak would speak if the voice isn't loaded.
@@ -315,25 +321,28 @@ def _speak(engine: PrivateEngine, voice: str, text: str) -> tuple[protocol.Ended
 
 
 def _memory_of(pid: int) -> int | None:
-    """Return the resident memory of a process in bytes, or None if it is unknown."""
+    """Return the resident memory of a process in bytes."""
     statm = read_proc_file(f"/proc/{pid}/statm")  # the second number is the count of resident pages
     return int(statm.split()[1]) * os.sysconf("SC_PAGE_SIZE") if statm else None
 
 
 def judge_server_voices(voices: dict[str, Any]) -> list[Finding]:
-    """Return the findings about the neural voices of a server whose files can't be examined.
+    """Return the findings about the server's neural voices, without examining files.
 
     `voices` is the server's description of its neural voices.
     """
     for voice, each in voices.items():
         if each.get("state") == "failed":
-            step = f"check whether this is still true: talk set --voice {voice}"
+            step = f"try to load the voice again: talk set --voice {voice}"
             return [warning(_NEURAL_CHECK, f"the server cannot speak with the voice {voice}: {each.get('why')}", step)]
     return [ok(_NEURAL_CHECK, f"the server's neural voices: {join_names(list(voices))}")] if voices else []
 
 
 def judge_trial(used: str, trial: VoiceTrial, server_voices: dict[str, Any] | None) -> Finding:
-    """Return the finding about trying the neural voice in use. The other arguments are those of `check_neural`."""
+    """Return the finding about the trial of a neural voice.
+
+    The other arguments are those of `check_neural`.
+    """
     broken = failure if server_voices is None else warning
     words = f"{used} is in use: "
     if trial.speed is None:

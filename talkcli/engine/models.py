@@ -1,4 +1,4 @@
-"""Functions to find the files of neural voices, check their permissions, and read their descriptions.
+"""Functions to find, check and describe neural voices.
 
 A voice consists of NAME.onnx and NAME.onnx.json, either in one of `paths.voice_directories` or in an installed package
 `*_piper_voice`. Users give the name of the file and never a path, so a client can't make the server read any other
@@ -29,7 +29,7 @@ PACKAGE_VARIABLES = {
     # Since version 1.30, onnxruntime writes a device id into ~/.cache/Microsoft when it is imported, and contacts a
     # server some seconds later. A robot must never do this.
     "ORT_DISABLE_TELEMETRY": "1",
-    # When it is imported, numpy would start threads that take longer than the import itself. Voices don't need them.
+    # Importing numpy would start threads, which takes longer than the import itself. Voices don't need them.
     "OPENBLAS_NUM_THREADS": "1",
 }
 
@@ -52,7 +52,7 @@ PAD_SYMBOL, BEGIN_SYMBOL, END_SYMBOL = "_", "^", "$"
 
 
 class VoiceFileError(Exception):
-    """Raised if a file of a voice is missing, unsafe or invalid. The message names the file and says what to do."""
+    """Raised if a neural voice can't be used."""
 
 
 @frozen
@@ -76,7 +76,7 @@ class VoiceDescription:
 
 
 def missing_package() -> str | None:
-    """Return an error message if a package for neural voices is missing, otherwise None."""
+    """Return an error message if a package for neural voices is missing."""
     from importlib.util import find_spec
 
     missing = next((each for each in install.NEURAL_PACKAGES if find_spec(each) is None), None)
@@ -103,12 +103,12 @@ def find_models(environment: Mapping[str, str] | None = None) -> dict[str, str]:
 
 
 def installed_voices() -> tuple[Voice, ...]:
-    """Return all installed neural voices, with the details from their descriptions if these can be read."""
+    """Return all installed neural voices, with details if their descriptions can be read."""
     return tuple(_describe_voice(name, path) for name, path in find_models().items())
 
 
 def undescribed_voices(environment: Mapping[str, str] | None = None) -> tuple[Voice, ...]:
-    """Return all installed neural voices by name only, without reading their descriptions."""
+    """Return all installed neural voices without reading their descriptions."""
     return tuple(Voice(NEURAL_PREFIX + name, None, name) for name in find_models(environment))
 
 
@@ -132,7 +132,9 @@ def read_description(path: str) -> VoiceDescription:
 
 
 def open_checked(path: str, missing: str = "restore it", model: str = "") -> Any:
-    """Open a binary file for reading, but only if no other user can change it.
+    """Open a binary file for reading.
+
+    Raise VoiceFileError if another user could change it.
 
     Args:
         path: The path of the file.
@@ -155,7 +157,7 @@ def open_checked(path: str, missing: str = "restore it", model: str = "") -> Any
 
 
 def _require_safe_paths(*paths: str) -> None:
-    """Raise VoiceFileError if another user could replace these files, or a directory or link in their paths.
+    """Raise VoiceFileError if another user could replace these files.
 
     In a sticky directory such as /tmp, only the owner of an entry can replace it. Everyone may write to such a
     directory, but it must not directly contain a voice file or a link to one.
@@ -178,7 +180,7 @@ def _require_safe_paths(*paths: str) -> None:
 
 
 def _walk_path(path: str) -> Iterator[tuple[str, bool]]:
-    """Yield each directory in a file's path and then the file, following symbolic links.
+    """Yield each directory in a file's path, and then the file itself.
 
     Each path comes with a flag, which is True if another directory follows.
 
@@ -208,7 +210,7 @@ def _walk_path(path: str) -> Iterator[tuple[str, bool]]:
 
 
 def _others_can_write(path: str, status: os.stat_result) -> bool:
-    """Return whether a file's mode or access control list lets anyone except root and this user write to it."""
+    """Return whether anyone except root and this user may write to a file."""
     if status.st_mode & stat.S_IWOTH:
         return True
     if not status.st_mode & stat.S_IWGRP:
@@ -224,7 +226,7 @@ def _require_safe_owner(path: str, status: os.stat_result) -> None:
 
 
 def _has_acl(path: str) -> bool:
-    """Return whether a file may have an access control list, which can allow more users to write to it."""
+    """Return whether a file may have an access control list."""
     try:
         return hasattr(os, "listxattr") and "system.posix_acl_access" in os.listxattr(path)
     except OSError as error:
@@ -232,7 +234,7 @@ def _has_acl(path: str) -> bool:
 
 
 def _is_private_group(user: int, group: int) -> bool:
-    """Return whether a group has this user as its only member, like the groups that Debian creates for each user."""
+    """Return whether this user is the only member of a group."""
     import grp
     import pwd
 
@@ -246,7 +248,10 @@ def _is_private_group(user: int, group: int) -> bool:
 
 
 def _writable_error(*paths: str) -> VoiceFileError:
-    """Return the error for files that other users can write to. It includes a command that fixes all of them."""
+    """Return the error for files that other users can write to.
+
+    It includes a command that fixes all of them.
+    """
     import shlex  # imported here because it is rarely needed
 
     names = f"{', '.join(paths[:-1])} and {paths[-1]}" if len(paths) > 1 else paths[0]
@@ -256,7 +261,7 @@ def _writable_error(*paths: str) -> VoiceFileError:
 
 
 def _model_directories(environment: Mapping[str, str] | None) -> Iterator[str]:
-    """Yield the directories to search for models, including those in installed Python packages."""
+    """Yield the directories to search for models."""
     yield from voice_directories(environment)
     for directory in filter(None, sys.path):
         for package in _list_entries(os.path.abspath(directory), _PACKAGE_SUFFIX):
@@ -272,7 +277,7 @@ def _list_entries(directory: str, suffix: str) -> list[str]:
 
 
 def _describe_voice(name: str, path: str) -> Voice:
-    """Return the voice of a model, with the details from its description if it can be read."""
+    """Return the voice of a model, with details if its description can be read."""
     try:
         found = read_description(path)
     except VoiceFileError:
@@ -325,13 +330,16 @@ def _parse_description(content: Any) -> VoiceDescription:
 
 
 def _shorten(value: object) -> str:
-    """Return a value as text, which is cut off if it is too long to be shown to users."""
+    """Convert a value to text, and cut off long text."""
     words = str(value)
     return words if len(words) <= _MAX_SHOWN_CHARS else f"{words[:_MAX_SHOWN_CHARS]}…"
 
 
 def _checked_integer(value: object) -> int:
-    """Return the value if it is an integer from 0 to 2,147,483,647. Otherwise raise ValueError."""
+    """Return the value if it is an integer from 0 to 2,147,483,647.
+
+    Otherwise raise ValueError.
+    """
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 31:
         raise ValueError(f"{value!r} is not a valid integer")
     return value

@@ -55,7 +55,7 @@ class PlayerCommand:
 
 @frozen
 class KnownPlayer:
-    """A player that users can select by name: a program, or a class in `talkcli.engine.child.players`."""
+    """A player that users can select by name."""
 
     #: a short description of the player's output, such as "ALSA"
     description: str
@@ -177,7 +177,10 @@ def player_commands(player: str | None, device: str | None, rate: int, last: str
 
 
 def _parse_custom_command(player: str, device: str | None, rate: int) -> PlayerCommand:
-    """Return a custom player command with its placeholders filled in. Its program must be installed."""
+    """Return a custom player command with its placeholders filled in.
+
+    Raise PlayerMissing if it can't be run.
+    """
     import shlex
 
     try:
@@ -216,7 +219,7 @@ def sound_server_sockets(env: Mapping[str, str], *uids: int) -> list[str]:
 
 
 def has_no_output(env: Mapping[str, str], nodes: str = "/dev/snd", etc: str = "/etc") -> bool:
-    """Return whether it is certain that this process can't play any sound.
+    """Return whether this process certainly can't play any sound.
 
     This only looks at file names, so that no sleeping device wakes up. Any custom configuration counts as an output,
     because it may lead to any device.
@@ -235,7 +238,10 @@ def _config_home(env: Mapping[str, str]) -> str:
 
 
 def _has_default_server(path: str) -> bool:
-    """Return whether PulseAudio's client configuration names a server. Debian's default file doesn't."""
+    """Return whether PulseAudio's client configuration names a server.
+
+    Debian's default file doesn't.
+    """
     with contextlib.suppress(OSError), open(path, "rb") as file:
         return any(line.lstrip().startswith(b"default-server") for line in file)
     return False

@@ -93,7 +93,10 @@ class Configure:
 
 @frozen
 class Speak:
-    """The command to speak a text. Rate, volume and pitch are absolute values, not relative changes."""
+    """The command to speak a text.
+
+    Rate, volume and pitch are absolute values, not relative changes.
+    """
 
     id: str
     text: str
@@ -123,14 +126,20 @@ class Append:
 
 @frozen
 class Stop:
-    """The command to stop speaking a goal at once. It is ignored if the goal has already ended."""
+    """The command to stop speaking a goal at once.
+
+    The process ignores it if the goal has already ended.
+    """
 
     id: str
 
 
 @frozen
 class Hold:
-    """The command to pause a goal, and to send `Held` once it is silent. It is ignored if the goal has ended."""
+    """The command to pause a goal.
+
+    The process sends `Held` once the goal is silent, or nothing if it has ended.
+    """
 
     id: str
     number: int  # number of this pause within the goal, starting at 1
@@ -138,14 +147,14 @@ class Hold:
 
 @frozen
 class Continue:
-    """The command to resume a paused goal. It is ignored if the goal is not paused."""
+    """The command to resume a goal. The process ignores it if the goal is not paused."""
 
     id: str
 
 
 @frozen
 class NextGoal:
-    """The command to update whether another goal waits behind the current one, and whether it has a neural voice."""
+    """The command that describes the next goal in the queue."""
 
     id: str  # ID of the current goal
     next_waits: bool  # whether another goal is waiting in the queue
@@ -154,14 +163,20 @@ class NextGoal:
 
 @frozen
 class LoadVoice:
-    """The command to load a neural voice in the background. The reply is one `VoiceLoaded`."""
+    """The command to load a neural voice in the background.
+
+    The reply is one `VoiceLoaded`.
+    """
 
     voice: str  # ID of the voice, without a speaker
 
 
 @frozen
 class DropVoice:
-    """The command to unload a neural voice once no sentence uses it. If it was loaded, the reply is `VoiceMemory`."""
+    """The command to unload a neural voice once no sentence uses it.
+
+    If it was loaded, the reply is `VoiceMemory`.
+    """
 
     voice: str  # ID of the voice, without a speaker
 
@@ -174,8 +189,8 @@ class Voice:
     language: str | None
     name: str
     quality: str | None = None  # quality level of a neural voice, such as "medium"
-    #: speakers of a neural voice, in the order of their numbers. In messages, this is None, because pyttsx3's list of
-    #: voices has no field for speakers.
+    #: speakers of a neural voice, sorted by number. In messages, this is None, because pyttsx3's list of voices has no
+    #: field for speakers.
     speakers: tuple[str, ...] | None = None
 
 
@@ -201,7 +216,10 @@ class StartFailed:
 
 @frozen
 class VoiceList:
-    """All voices that the driver offers. Sent once, right after `Ready`, if `Configure.list_voices` is true."""
+    """All voices that the driver offers.
+
+    Sent once, right after `Ready`, if `Configure.list_voices` is true.
+    """
 
     voices: tuple[Voice, ...]
 
@@ -224,7 +242,10 @@ class VoiceUnloaded:
 
 @frozen
 class VoiceMemory:
-    """The memory used by neural voices. Sent before `VoiceLoaded`, and after a sentence or a `DropVoice`."""
+    """The memory used by neural voices.
+
+    Sent before `VoiceLoaded`, and after a sentence or a `DropVoice`.
+    """
 
     voice: str  # ID of the voice that was loaded or used, without a speaker; empty after `DropVoice`
     memory: int  # memory growth in bytes, measured from before the first neural voice was loaded
@@ -265,7 +286,10 @@ class TextMissing:
 
 @frozen
 class OutputChanged:
-    """The device, volume and mute state of the current output. Sent when they become known or change."""
+    """The device, volume and mute state of the current output.
+
+    Sent when they become known or change.
+    """
 
     id: str
     output: JsonObject | None  # the goal's `output` field as JSON; None if the player can't determine it
@@ -273,7 +297,10 @@ class OutputChanged:
 
 @frozen
 class VoiceChosen:
-    """The voice that speaks the sentence. Sent again if a fallback voice replaces it before the first word."""
+    """The voice that speaks the sentence.
+
+    Sent again if a fallback voice replaces it before the first word.
+    """
 
     id: str
     voice: str  # voice ID

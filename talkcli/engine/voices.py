@@ -64,7 +64,7 @@ def list_voices(engine: Any) -> tuple[Voice, ...]:
 
 
 def find_voice(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> Voice | None:
-    """Find a voice by name. Return None if no voice matches, or more than one.
+    """Find a voice by name. Return None if there is no match, or more than one.
 
     The name is compared with the ids, the last parts of the ids, the names and the languages of the voices, in this
     order, ignoring case. It may end with a variant ("en-us+f3"). The returned voice's id includes the variant. If
@@ -82,7 +82,7 @@ def find_voice(wanted: str, voices: tuple[Voice, ...], preferred: str | None = N
 
 
 def matching_languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
-    """Return the languages that match a language code or an English name, such as "en-gb" for "English"."""
+    """Return the languages that match a language code or an English name."""
     known = {each.language for each in voices if each.language}
     word = _fold(wanted)
     region = _WITH_REGION.fullmatch(word)
@@ -95,7 +95,7 @@ def matching_languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
 
 
 def _matching_voices(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> dict[str, Voice]:
-    """Return the voices that a name may refer to, with their unambiguous names as keys."""
+    """Return the voices that a name may refer to, by unambiguous name."""
     for words in _possible_names(wanted, voices):
         fitting: dict[Voice, str] = {}
         for word in words:
@@ -108,7 +108,7 @@ def _matching_voices(wanted: str, voices: tuple[Voice, ...], preferred: str | No
 
 
 def _possible_names(wanted: str, voices: tuple[Voice, ...]) -> Iterator[list[str]]:
-    """Yield the name that the user typed, and then similar names, as lists from most to least likely."""
+    """Yield lists of names to try, most likely first."""
     yield [wanted]
     name, mark, speaker = wanted.partition(SPEAKER_MARK)
     word = _fold(name)
@@ -151,7 +151,7 @@ def _english_names(voice: Voice) -> list[str]:
 
 
 def _short_names(neural: str) -> list[str]:
-    """Return the short names of a neural voice, such as "joe" and "en_US-joe" for "piper/en_US-joe-low".
+    """Return the short names of a neural voice, such as "joe" and "en_US-joe".
 
     They don't include the language alone.
     """
@@ -194,7 +194,7 @@ def neural_language(voice: str) -> str:
 
 
 def speaker_number(speaker: str, numbers: Mapping[str, int], count: int) -> int:
-    """Return the number of a speaker of a neural voice, given the speaker's name or number.
+    """Return the number of a speaker, given the speaker's name or number.
 
     Args:
         speaker: The name or number, or "" for the first speaker.
@@ -216,7 +216,9 @@ def speaker_number(speaker: str, numbers: Mapping[str, int], count: int) -> int:
 
 
 def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], foreign_driver: str | None = None) -> str:
-    """Return the error message for an unknown voice. It suggests similar voices, or says what to do next.
+    """Return the error message for an unknown voice.
+
+    It suggests similar voices, or says what to do next.
 
     Args:
         wanted: The name that the user typed.
@@ -245,7 +247,7 @@ def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], foreign_driver
 
 
 def _suggestions(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
-    """Return known names that are similar to an unknown name, in the form that a user types."""
+    """Suggest known names that are similar to an unknown name."""
     plain, variants = _split_variants(voices)
     neural = [each for each in voices if is_neural(each.id)]
     if is_neural(wanted):
@@ -269,13 +271,19 @@ def _suggestions(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
 
 
 def _split_variants(voices: Sequence[Voice]) -> tuple[list[Voice], list[Voice]]:
-    """Return two lists: the voices of libespeak-ng or another driver, and the variants. Omit neural voices."""
+    """Split a list of voices into voices and variants.
+
+    Omit neural voices.
+    """
     plain = [each for each in voices if not each.id.startswith((VARIANT_PREFIX, NEURAL_PREFIX))]
     return plain, [each for each in voices if each.id.startswith(VARIANT_PREFIX)]
 
 
 def _find_by_name(wanted: str, voices: Sequence[Voice]) -> Voice | None:
-    """Find a voice by name, ignoring case. If several match, prefer the one with the same spelling."""
+    """Find a voice by name, ignoring case. Return None if there is none.
+
+    If several voices match, prefer the one with the same spelling.
+    """
     word = _fold(wanted)
     found = [
         (called != wanted, place, voice)
@@ -287,17 +295,19 @@ def _find_by_name(wanted: str, voices: Sequence[Voice]) -> Voice | None:
 
 
 def _fold(word: str) -> str:
-    """Normalize a name for comparisons: lower case, with dashes instead of underscores."""
+    """Normalize a name for comparisons."""
     return word.casefold().replace("_", "-")
 
 
 def _names_of(voice: Voice) -> tuple[str, str, str, str]:
-    """Return the names by which a voice can be found, in the order in which they are tried."""
+    """Return the names by which a voice can be found."""
     return voice.id, voice.id.rpartition("/")[2], voice.name, voice.language or ""
 
 
 def _find_variant(suffix: str, variants: list[Voice]) -> Voice | None:
     """Find a variant by the part of a voice's name after the "+".
+
+    Return None if there is none.
 
     As in libespeak-ng, the numbers 1 to 9 select male variants, and the numbers from 11 on select female variants.
     """

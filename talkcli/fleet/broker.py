@@ -191,7 +191,7 @@ def is_local(host: str) -> bool:
 
 def _refuse_passphrase() -> str:
     """Raise UsageError when OpenSSL asks for the passphrase of a key."""
-    raise UsageError("the key has a passphrase, which talk can't ask for; use a key without one")
+    raise UsageError("the key has a passphrase, which talk can't ask for; use a key without a passphrase")
 
 
 def _describe_file_error(path: str | None, error: Exception) -> str:

@@ -65,7 +65,10 @@ _LINGER_DISCARD, _LINGER_DELIVER = struct.pack("ii", 1, 0), struct.pack("ii", 0,
 
 
 def boottime() -> float:
-    """Return the seconds since the machine booted. On Linux, this includes time spent suspended."""
+    """Return the seconds since the machine booted.
+
+    On Linux, this includes time spent suspended.
+    """
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
@@ -92,8 +95,8 @@ class Link:
             on_message: called with each received message.
             will: retained message that the broker publishes if the connection breaks.
             max_packet_bytes: largest packet that the broker may send.
-            receive_maximum: how many unacknowledged QoS 1 messages the broker may send. None for the broker's default,
-                with which a flood can't stop mosquitto from delivering later messages.
+            receive_maximum: how many unacknowledged QoS 1 messages the broker may send. If None, the
+                broker's default applies, so that a flood of messages can't stop mosquitto from delivering later ones.
 
         Raises:
             UsageError: a certificate or key file is unusable.
@@ -156,7 +159,7 @@ class Link:
             )
         except ssl.SSLCertVerificationError as error:
             words = f"the broker's certificate is not trusted: {error.verify_message} ({url})"
-            raise AccessDenied(f"{words}; set TALK_MQTT_CA to the file of the CA that issued it") from error
+            raise AccessDenied(f"{words}; set TALK_MQTT_CA to the certificate file of its CA") from error
         except ssl.SSLError as error:
             raise ServerUnavailable(f"TLS with the broker at {url} failed: {error.reason or error}") from error
         except (OSError, ValueError) as error:  # ValueError means that the host name is invalid
@@ -215,13 +218,16 @@ class Link:
                 self._paho.loop_write()
 
     def tick(self) -> None:
-        """Send keepalive messages, and check that the broker answers them. Call this every `TICK_EVERY_S` seconds."""
+        """Send keepalive messages, and check that the broker answers them.
+
+        Call this every `TICK_EVERY_S` seconds.
+        """
         with self._lock:
             if self.ended is None:
                 self._paho.loop_misc()
 
     def publish(self, message: Message, qos: int = 1, acknowledged: OnAcknowledged | None = None) -> bool:
-        """Publish a message, and return whether the connection was still open.
+        """Publish a message if the connection is still open.
 
         Args:
             message: the message. Its payload has at most `max_payload_bytes`.
@@ -274,14 +280,14 @@ class Link:
                 self._socket = None
 
     def drop(self) -> None:
-        """Close a forked child's copy of the descriptor. The parent process stays connected."""
+        """Close a forked child's copy of the descriptor."""
         if self._socket is not None:
             os.close(self._socket.detach())
 
     # -- internals
 
     def _tls_pending(self) -> bool:
-        """Return whether the TLS layer holds decrypted data, which polling can't detect."""
+        """Return whether the TLS layer holds unread data."""
         return isinstance(self._socket, ssl.SSLSocket) and self._socket.pending() > 0
 
     def _login_error(self) -> TalkError | None:
@@ -310,7 +316,7 @@ class Link:
     def _on_connect(
         self, _client: paho.Client, _data: object, _flags: object, code: ReasonCode, properties: Properties | None
     ) -> None:
-        """Store the broker's response to the login, and the size of the largest payload that it accepts."""
+        """Store the broker's response to the login, and its size limit."""
         self._answer = code
         # Turn off paho's log, which is only needed to explain a failed login. It would use a tenth of the CPU time.
         self._paho.on_log = None
@@ -345,7 +351,10 @@ class Link:
 
 @lru_cache(maxsize=32)
 def _properties(expiry: float | None, response: str | None, correlation: bytes | None) -> Properties:
-    """Return the MQTT properties for a message. They are cached, because creating them is slow."""
+    """Return the MQTT properties for a message.
+
+    They are cached, because creating them is slow.
+    """
     properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
     if expiry is not None:
         properties.MessageExpiryInterval = max(1, math.ceil(min(expiry, 2**31)))
@@ -380,7 +389,10 @@ class LinkOpener:
                 self.link.close()
 
     def _open(self) -> None:
-        """Open the link and store any error. Then call `on_done`, or close the link if `cancel` was called."""
+        """Open the link and store any error.
+
+        Then call `on_done`, or close the link if `cancel` was called.
+        """
         try:
             self.link.open()
         except TalkError as error:

@@ -1,4 +1,4 @@
-"""The messages of a fleet: presence, status, and robots' descriptions for Home Assistant.
+"""The messages that robots of a fleet publish.
 
 Rules for this file: no I/O. Any client of the broker may have written a received payload, so invalid fields are treated
 as missing.
@@ -60,7 +60,7 @@ class Presence:
 
     @classmethod
     def read(cls, name: str, payload: bytes) -> Presence | None:
-        """Parse a presence message, or return None if the robot's name or the payload is invalid.
+        """Parse a presence message, or return None if it is invalid.
 
         An empty payload, which clears a retained presence, also counts as invalid.
         """
@@ -78,7 +78,7 @@ class Presence:
 
 
 def bridge_rank(presence: Presence | None) -> tuple[float, str] | None:
-    """Return a bridge's rank among the bridges with the same robot name, or None if it is offline.
+    """Return a bridge's rank among the bridges with the same robot name.
 
     The bridge with the lowest rank keeps the robot's name. The others exit.
     """
@@ -115,7 +115,7 @@ class RobotStatus:
 
     @classmethod
     def read(cls, payload: bytes) -> RobotStatus | None:
-        """Parse a status message, or return None if the payload is empty or malformed."""
+        """Parse a status message, or return None if it is invalid."""
         said = _decode_object(payload)
         if said is None:
             return None
@@ -125,7 +125,7 @@ class RobotStatus:
         return cls(**found, last=LastGoal(**last) if "id" in last and "state" in last else None)
 
     def events(self) -> list[StateChanged]:
-        """Convert the status to events: the end of the last goal, and the start of the active goal."""
+        """Convert the status to events of the last and the active goal."""
         last, found = self.last, []
         if last:
             ended = Goal(last.id, last.state, last.text, last.reason, ended_at=last.at)
@@ -217,7 +217,7 @@ def homeassistant_device(name: str, allow: Collection[str], version: str) -> Mes
 
 
 def _command(name: str, kind: str, platform: str, label: str | None, *, allowed: bool) -> JsonObject:
-    """Return a Home Assistant component that sends a request, or an empty one if the request isn't allowed."""
+    """Return a Home Assistant component that sends a request."""
     if not allowed:
         return {"platform": platform}
     topic = topics.robot(name, kind, topics.HOMEASSISTANT)

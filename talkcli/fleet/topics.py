@@ -17,7 +17,7 @@ ROBOT_LEVEL, _GROUP, _REPLY = "robot", "group", "reply"
 ALL_ROBOTS = "all"
 #: Wildcard that matches any single level of a topic in a subscription.
 ANY = "+"
-#: Placeholder for the robot's name in a topic on which a desk sends messages to itself. It isn't a valid robot name.
+#: Stands for the robot's name in topics on which a client sends messages to itself. It isn't a valid robot name.
 MARKER = "_"
 #: A remote client's name at the server consists of this prefix and the client's user name.
 REMOTE_PREFIX = "mqtt:"
@@ -36,7 +36,7 @@ HOMEASSISTANT_STATUS = f"{HOMEASSISTANT}/status"
 
 
 def name_fault(name: str) -> str | None:
-    """Return the reason why a robot, group or user name is invalid, or None if it is valid."""
+    """Return the reason why a robot, group or user name is invalid."""
     if _NAME_PATTERN.fullmatch(name):
         return None
     return f"must have 1 to {MAX_NAME_CHARS} characters (A-Z a-z 0-9 . _ -), and begin with a letter or a digit"
@@ -73,7 +73,7 @@ def homeassistant_device(name: str) -> str:
 
 
 def parse_request(topic: str) -> tuple[str, str] | None:
-    """Return a request topic's kind and its client's user name, or None for any other topic.
+    """Return the kind and the client's user name of a request topic.
 
     Returns:
         REQUEST, PLAIN_SAY or PLAIN_CANCEL, and the client's user name. The broker's access rules verify the name.
@@ -87,7 +87,7 @@ def parse_request(topic: str) -> tuple[str, str] | None:
 
 
 def checked_reply(response: str, user: str, robot_name: str) -> str | None:
-    """Return the topic for a robot's reply, or None if the client may not use its response topic.
+    """Return the topic for a robot's reply, if the client may use it.
 
     This prevents users from making a robot publish to other users or to another robot's topic.
     """
@@ -140,7 +140,7 @@ def access_rules(
     if homeassistant:
         lines += [
             "",
-            "# Home Assistant may let each robot speak, cancel its sentences, and use all of its own topics.",
+            "# Home Assistant may make each robot speak, cancel sentences, and use all topics under homeassistant/.",
             f"user {HOMEASSISTANT}",
             f"topic write {robot('+', PLAIN_SAY, HOMEASSISTANT)}",
             f"topic write {robot('+', PLAIN_CANCEL, HOMEASSISTANT)}",
@@ -149,6 +149,6 @@ def access_rules(
             f"topic readwrite {HOMEASSISTANT}/#",
         ]
     if homeassistant and name is not None and "." in name:
-        words = "# This robot has another topic for Home Assistant, which allows no dot in a name."
+        words = "# Home Assistant does not allow dots in names, so this robot uses a different topic."
         lines += ["", words, f"user {name}", f"topic write {homeassistant_device(name)}"]
     return "\n".join(lines)

@@ -50,7 +50,7 @@ class Sender:
 
 @frozen
 class By:
-    """The goal or client that ended or rejected a goal, or the client that paused or resumed speech.
+    """The goal or client that ended a goal, or the client that paused or resumed speech.
 
     Both fields are None if the server itself ended the goal.
     """
@@ -59,7 +59,7 @@ class By:
     client: Sender | None = None
 
     def to_json(self) -> JsonObject | None:
-        """Return a JSON object with the goal or the client, or None if both are None."""
+        """Return a JSON object with the goal or the client."""
         if self.goal is not None:
             return {"goal": self.goal}
         return None if self.client is None else {"client": self.client.to_json()}
@@ -95,7 +95,9 @@ class Output:
 
 @frozen
 class Goal:
-    """An immutable copy of a goal. Its JSON always contains all keys, with null for unknown values.
+    """An immutable copy of a goal.
+
+    Its JSON always contains all keys, with null for unknown values.
 
     Times are seconds since 1970 UTC. `duration` is the length of the audio in seconds.
     """
@@ -172,7 +174,10 @@ class Goal:
 
     @classmethod
     def from_json(cls, value: object) -> Goal:
-        """Read a goal from its JSON object. Raises Unreadable if the id or the state is missing or invalid."""
+        """Read a goal from its JSON object.
+
+        Raises Unreadable if the id or the state is missing or invalid.
+        """
         found = read_fields(cls, value)
         if not str(found.get("id", "\n")).isprintable() or "state" not in found:  # ids are printed unescaped
             raise Unreadable("received a goal with an invalid id or an unknown state")
@@ -180,7 +185,10 @@ class Goal:
 
 
 def read_fields(cls: type, message: object) -> dict[str, Any]:
-    """Return the fields of a class that a JSON object contains, as a dict. Values of the wrong type are skipped."""
+    """Read the fields of a class from a JSON object.
+
+    Values of the wrong type are skipped.
+    """
     found = {}
     values = message if isinstance(message, dict) else {}
     for name, annotation in cls.__annotations__.items():
@@ -191,18 +199,18 @@ def read_fields(cls: type, message: object) -> dict[str, Any]:
 
 
 def message_details(message: str | None) -> str:
-    """Return a goal's message without a beginning that only repeats the state, such as "speech failed: "."""
+    """Return a goal's message without a prefix such as "speech failed: "."""
     head, _, details = (message or "").partition(": ")
     return details if head in _STATE_WORDS else message or ""
 
 
 def _reader(kind: type) -> Callable[[object], object]:
-    """Return a function that returns its argument if it has exactly this type, and None otherwise."""
+    """Create a function that turns values of any other type into None."""
     return lambda value: value if type(value) is kind else None
 
 
 def read_seconds(value: object) -> float | None:
-    """Return a time in seconds from a message, or None if it isn't a number or is too large."""
+    """Return a time in seconds from a message, or None if it is not valid."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
     return float(value) if number and abs(value) <= _MAX_TIME_S else None  # type: ignore[arg-type]
 

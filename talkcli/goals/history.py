@@ -41,16 +41,19 @@ MAX_EARLY_CANCELS = 1_000
 
 
 class History:
-    """Records of ended goals, oldest first. The number of goals and the size of their texts are limited."""
+    """Records of ended goals, oldest first.
+
+    The number of goals and the size of their texts are limited.
+    """
 
     def __init__(self) -> None:
         self._all: dict[str, Record] = {}
-        #: goal ids by state, oldest first, with SUCCEEDED used for all spoken goals
+        #: goal ids by state, oldest first. All spoken goals are listed under SUCCEEDED.
         self._ids: defaultdict[State, deque[str]] = defaultdict(deque)
         self._text_bytes = 0
 
     def add(self, record: Record) -> None:
-        """Add an ended goal. If a limit is exceeded, drop the oldest goals or texts."""
+        """Add an ended goal, and drop old goals or texts if there are too many."""
         limits = {State.REJECTED: MAX_REJECTED_GOALS, State.RECALLED: MAX_RECALLED_GOALS}
         ids = self._ids[record.state if record.state in limits else State.SUCCEEDED]
         ids.append(record.id)
@@ -68,7 +71,7 @@ class History:
         return self._all.get(goal_id)
 
     def latest(self, count: int, *, rejected: bool) -> list[Record]:
-        """Return the most recently ended goals, oldest first, with or without REJECTED goals.
+        """Return the most recently ended goals, oldest first.
 
         Args:
             count: the maximum number of goals.
@@ -82,17 +85,20 @@ class SpeechTimes:
     """Remembers when each key and each text was last spoken."""
 
     def __init__(self) -> None:
-        #: start time and id of the last goal, by its key and by a hash of its text
+        #: start time and id of the last goal for each key and each hash of a text
         self._starts: OrderedDict[str | bytes, tuple[float, str]] = OrderedDict()
 
     def add(self, record: Record) -> None:
-        """Record the start time of a goal that was at least partly heard, by its key and by its text."""
+        """Record when a goal started, under its key and its text.
+
+        The goal must have been heard, at least in part.
+        """
         for each in (record.say.key, _digest(record.say.text)):
             if each is not None:
                 _set_newest(self._starts, each, (record.began_at, record.id), MAX_SPEECH_TIMES)
 
     def last_goal_id(self, since: float, key: str | None, text: str) -> str | None:
-        """Return the id of the last goal after `since` with this key, or with this text if the key is None.
+        """Return the id of the last goal with a key or, without a key, with a text.
 
         Return None if no goal started after `since` (monotonic) with this key or text.
         """
@@ -112,13 +118,16 @@ class EarlyCancels:
         _set_newest(self._cancels, goal_id, (now + EARLY_CANCEL_S, by), MAX_EARLY_CANCELS)
 
     def find(self, goal_id: str | None, now: float) -> By | None:
-        """Return the client that cancelled this goal id, or None if there was no recent cancel."""
+        """Return the client that recently cancelled a goal id, if any."""
         lapses_at, by = self._cancels.get(goal_id, (now, None))
         return by if now < lapses_at else None
 
 
 def _set_newest(entries: OrderedDict[_Key, _Value], key: _Key, value: _Value, limit: int) -> None:
-    """Add or replace an entry as the newest one. If there are too many entries, drop the oldest."""
+    """Add or replace an entry as the newest one.
+
+    If there are too many entries, drop the oldest.
+    """
     entries[key] = value
     entries.move_to_end(key)
     if len(entries) > limit:
@@ -126,5 +135,8 @@ def _set_newest(entries: OrderedDict[_Key, _Value], key: _Key, value: _Value, li
 
 
 def _digest(text: str) -> bytes:
-    """Return a hash of a text. Keeping ten thousand texts instead could use 400 MB of memory."""
+    """Return a hash of a text.
+
+    Keeping ten thousand texts instead could use 400 MB of memory.
+    """
     return hashlib.blake2b(text.encode(errors="surrogatepass"), digest_size=16).digest()

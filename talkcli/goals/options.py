@@ -65,7 +65,7 @@ _MAX_FLOAT = 1.7976931348623157e308
 
 
 def without_speaker(voice: str | None) -> str:
-    """Return the id of a voice without its speaker, or an empty string if the voice is None."""
+    """Return the id of a voice without its speaker."""
     return (voice or "").partition(SPEAKER_MARK)[0]
 
 
@@ -90,7 +90,10 @@ class Kind:
 
 
 def is_clients_id(goal_id: str) -> bool:
-    """Return whether a client may choose this id. Ids that look like the server's own are reserved."""
+    """Return whether a client may choose this id.
+
+    Ids that look like the server's own are reserved.
+    """
     if not (0 < len(goal_id) <= MAX_ID_CHARS and _ID_CHARACTERS.issuperset(goal_id)) or goal_id[0] == "-":
         return False
     boot, dash, number = goal_id.partition("-")
@@ -102,7 +105,7 @@ def is_clients_id(goal_id: str) -> bool:
 
 
 def _id_error(value: str) -> str | None:
-    """Return an error message if an id is empty or too long, or None."""
+    """Return an error message if an id is empty or too long."""
     return None if 0 < len(value) <= MAX_ID_CHARS else f"must have 1 to {MAX_ID_CHARS} characters"
 
 
@@ -112,7 +115,7 @@ def _offset_error(value: int) -> str | None:
 
 
 def _ids_error(value: list[object]) -> str | None:
-    """Return an error message if a list of ids is too long or contains an invalid id, or None."""
+    """Return an error message if a list of ids is too long or contains an invalid id."""
     if len(value) > MAX_IDS:
         return IDS.wrong_type
     errors = (_id_error(each) if isinstance(each, str) else ID.wrong_type for each in value)
@@ -120,7 +123,7 @@ def _ids_error(value: list[object]) -> str | None:
 
 
 def _data_error(value: JsonObject) -> str | None:
-    """Return an error message if a goal's `data` is too large or nested too deeply, or None."""
+    """Return an error message if a goal's `data` is too large or nested too deeply."""
     import json
 
     try:
@@ -214,7 +217,7 @@ class Option:
 
     @property
     def flags(self) -> str:
-        """Command-line flags, or an empty string if the option isn't available on the command line."""
+        """Command-line flags, or an empty string if there are none."""
         return self.special_flags or (f"--{self.name.replace('_', '-')}" if self.help else "")
 
     @property
@@ -223,7 +226,7 @@ class Option:
         return self.kind is not FLAG and self.flag_value is None
 
     def type_error(self, value: Any) -> str | None:
-        """Return an error message if a value has the wrong type or format, or None."""
+        """Return an error message if a value has the wrong type or format."""
         if value is None and self.default is None:
             return None
         kind = self.kind
@@ -232,7 +235,7 @@ class Option:
         return kind.check(value) if kind.check else None
 
     def value_error(self, value: Any) -> str | None:
-        """Return an error message if a value of the right type is not allowed, or None."""
+        """Return an error message if a value of the right type is not allowed."""
         if value is None:
             return None
         if self.limits != (None, None) and self.is_out_of_range(value):
@@ -259,13 +262,13 @@ class Option:
         return f"more than {low:g}" if self.excludes_minimum else f"{low:g} or more"
 
     def for_set(self) -> Option:
-        """Return a copy of the option for `talk set`, without a default, because omitted settings don't change."""
+        """Return a copy for `talk set`, with that command's flags and help."""
         setting = self.setting
         assert setting
         return replace(self, env="", special_flags=setting.flags or self.flags, help=setting.set_help or self.help)
 
     def for_serve(self) -> Option:
-        """Return a copy of the option for `talk serve`, with the initial setting as its default."""
+        """Return a copy for `talk serve`, with that command's flags, help and default."""
         setting = self.setting
         assert setting
         flags = (setting.flags or self.flags).split("/")[0]
@@ -273,40 +276,38 @@ class Option:
 
 
 def _check_priority(value: int) -> str | None:
-    """Return an error message if a priority is out of range, or None."""
+    """Return an error message if a priority is out of range."""
     if -MAX_PRIORITY <= value <= MAX_PRIORITY:
         return None
     return f"the priority must be {-MAX_PRIORITY:,} to {MAX_PRIORITY:,}, got {value}"
 
 
 def check_key(value: str) -> str | None:
-    """Return an error message if a string is not a valid key, or None."""
+    """Return an error message if a string is not a valid key."""
     if 0 < len(value) <= MAX_KEY_CHARS:
         return None
     return f"the key must have 1 to {MAX_KEY_CHARS} characters, got {len(value)}"
 
 
 def _check_own_id(value: str) -> str | None:
-    """Return an error message if a client must not choose this id, or None."""
+    """Return an error message if clients must not choose this id."""
     if is_clients_id(value):
         return None
     return (
-        f"the id {value[:MAX_ID_CHARS]!a} is not allowed: use 1 to {MAX_ID_CHARS} of A-Z a-z 0-9 . _ : / -, but not "
-        "only digits, no '-' at the beginning, and not the form of the server's own ids, such as 4k7f-12"
+        f"the id {value[:MAX_ID_CHARS]!a} is not allowed: use 1 to {MAX_ID_CHARS} characters from A-Z a-z 0-9 . _ : "
+        "/ -; an id can't be a number, begin with '-', or look like one of the server's own ids, such as 4k7f-12"
     )
 
 
 def _check_format(value: str) -> str | None:
-    """Return an error message if the value of the option `format` is not supported, or None."""
-    return (
-        None
-        if value in {"text", MARKDOWN}
-        else f"the format must be 'text' or 'markdown', got {value[:MAX_ID_CHARS]!r}"
-    )
+    """Return an error message if the format of a text is not supported."""
+    if value in {"text", MARKDOWN}:
+        return None
+    return f"the format must be 'text' or 'markdown', got {value[:MAX_ID_CHARS]!r}"
 
 
 def _check_voice(value: str) -> str | None:
-    """Return an error message if the name of a voice is empty, or None."""
+    """Return an error message if the name of a voice is empty."""
     return None if value else "the voice must not be empty"
 
 
@@ -328,7 +329,7 @@ OPTIONS = (
         "send the goal's states and its result to this connection",
         default=False,
         special_flags="-w, --wait",
-        help="Wait until the goal has ended. The exit code is the result.",
+        help="Wait until the goal has ended. The exit code shows the result.",
     ),
     Option(
         "feedback",
@@ -341,20 +342,20 @@ OPTIONS = (
     Option(
         "patient",
         FLAG,
-        "if the queue is full, wait for room instead of rejecting the goal (`queue_full`); `ttl` includes this time",
+        "if the queue is full, wait for room (at most for the `ttl`) instead of rejecting the goal (`queue_full`)",
         default=False,
     ),
     Option(
         "preempt",
         FLAG,
-        "interrupt the current goal, unless its priority is higher, and go first",
+        "interrupt the current goal unless it has a higher priority, and go before waiting goals with equal priority",
         special_flags="--preempt/--queue",
         help="Interrupt the current sentence, or wait in the queue. [default: the server's setting]",
         setting=Setting(
             False,
-            meaning="whether goals without `preempt` interrupt the current goal",
-            set_help="Let new sentences interrupt the current one, or wait. 'talk say --queue' always waits.",
-            serve_help="Let new sentences interrupt the current one. 'talk say --queue' always waits.",
+            meaning="whether goals that were sent without `preempt` interrupt the current goal",
+            set_help="Choose whether new sentences interrupt the current one. Otherwise, they wait in the queue.",
+            serve_help="Let new sentences interrupt the current sentence. 'talk say --queue' always waits.",
             flags="--preempt/--no-preempt",
             words="new goals interrupt",
             none_words="new goals wait",
@@ -370,26 +371,27 @@ OPTIONS = (
     Option(
         "priority",
         INTEGER,
-        "goals with a higher priority go first. Goals with the same priority are spoken in the order of their arrival",
+        "goals with a higher priority are spoken first, and goals with the same priority in the order of arrival",
         default=0,
         # The range is not in `limits`, because the help text would then show it.
         check=_check_priority,
         form=f"{-MAX_PRIORITY:,} to {MAX_PRIORITY:,}",
-        help="Go before sentences with a lower priority. Sentences with a higher one are never interrupted or removed.",
+        help="Set the priority. Sentences with a higher priority are spoken first, and this sentence never "
+        "interrupts them.",
         in_goal=True,
     ),
     Option(
         "ttl",
         SECONDS,
-        "seconds in which the goal must start, otherwise it is RECALLED; 0 for no limit",
+        "the goal is RECALLED if it has not started after this many seconds; 0 means no limit",
         limits=(0, None),
         help="Drop the sentence if it can't start within SEC seconds; 0 means no limit.",
         setting=Setting(
             0,
             none_value=0,
-            meaning="the `ttl` of goals that don't have one; 0 for no limit",
+            meaning="the `ttl` of goals that were sent without `ttl`; 0 means no limit",
             set_help=_EXPIRY_HELP,
-            serve_help=_EXPIRY_HELP + " 'talk say --ttl' sets another limit.",
+            serve_help=_EXPIRY_HELP + " 'talk say --ttl' overrides this limit.",
             words="ttl {} s",
             none_words="no ttl",
         ),
@@ -408,19 +410,19 @@ OPTIONS = (
     Option(
         "throttle",
         SECONDS,
-        "reject the goal if the same text is waiting, is being spoken, or started less than this many seconds ago. If "
-        "the goal has a key, only the current and earlier goals with the same key count",
+        "reject the goal if the same text is waiting, is being spoken, or started less than this many seconds ago. For "
+        "a goal with a key, keys are compared instead of texts, and waiting goals are ignored",
         limits=(0, None),
-        help="Skip the sentence if it was spoken in the last SEC seconds. With --key, only the keys are compared.",
+        help="Skip the sentence if it was spoken in the last SEC seconds. With --key, all sentences with it count.",
     ),
     Option(
         "id",
         WORD,
-        "an id that the sender chooses, see *Ids* below",
+        "an id chosen by the sender; see *Ids* below",
         check=_check_own_id,
-        form=f"1 to {MAX_ID_CHARS} characters of `A-Z a-z 0-9 . _ : / -`",
+        form=f"1 to {MAX_ID_CHARS} characters from `A-Z a-z 0-9 . _ : / -`",
         default_words="set by the server",
-        help="Choose the goal's id. A goal that is sent again with the same id is not spoken again.",
+        help="Choose the goal's id. If a goal with this id was already sent, the sentence is not spoken again.",
     ),
     Option(
         "rate",
@@ -455,7 +457,7 @@ OPTIONS = (
         setting=Setting(
             None,
             none_value=DEFAULT_VOICE,
-            set_help="Use this voice: an id, name or language from 'talk voices'. 'default' is the engine's own.",
+            set_help="Use this voice. It is an id, name or language from 'talk voices', or 'default'.",
             words="voice {}",
             none_words="default voice",
         ),
@@ -467,7 +469,7 @@ OPTIONS = (
         "wait until the voice is loaded, and abort the goal (`voice_failed`) if the voice can't be used, instead of "
         "speaking with espeak",
         default=False,
-        help="Never use another voice. Wait until the voice is loaded, and fail if it can't be used.",
+        help="Fail instead of speaking with another voice. Wait until the voice is loaded.",
         for_engine=True,
     ),
     Option(
@@ -482,7 +484,7 @@ OPTIONS = (
     Option(
         "lead_in",
         INTEGER,
-        "milliseconds of silence before the sentence, even directly after another one; 0 for none",
+        "milliseconds of silence before the sentence, even if another sentence has just ended; 0 means none",
         limits=(0, MAX_LEAD_IN_MS),
         unit=" milliseconds",
         metavar="MS",
@@ -492,7 +494,7 @@ OPTIONS = (
     Option(
         "audible",
         FLAG,
-        "abort the goal (`muted`) if its output is muted. If this can't be known, the goal is spoken",
+        "abort the goal (`muted`) if the output is known to be muted",
         help="Fail if the output is muted. [default: the server's setting]",
         for_engine=True,
     ),
@@ -599,7 +601,10 @@ class Append:
 
 @frozen
 class Set:
-    """A request to change the server's settings for goals that haven't started. None leaves a setting unchanged."""
+    """A request to change the server's settings for goals that haven't started.
+
+    None leaves a setting unchanged.
+    """
 
     kind: ClassVar[str] = "set"
     meaning: ClassVar[str] = "Change the server's settings for goals that haven't started. Omit a setting to keep it"
@@ -614,29 +619,31 @@ class Set:
 
 @frozen
 class Cancel:
-    """A request to cancel every goal that matches at least one field, or all goals if no field is set.
+    """A request to cancel all goals, or only those that match at least one field.
 
     Goals that wait for room in the queue (`patient`) are cancelled, too.
     """
 
     kind: ClassVar[str] = "cancel"
     meaning: ClassVar[str] = (
-        "Cancel the goals that match any of the fields, even `patient` goals that wait for room. Without "
-        "fields, cancel all goals"
+        "Cancel the goals that match any of the fields, including `patient` goals that are waiting for room. "
+        "Without fields, cancel all goals"
     )
     options: ClassVar[tuple[Option, ...]] = (
-        Option("ids", IDS, "these goals; an empty list selects no goal", form=f"of up to {MAX_IDS:,} ids"),
+        Option(
+            "ids", IDS, "the goals with these ids; an empty list selects no goals", form=f"of up to {MAX_IDS:,} ids"
+        ),
         Option(
             "current",
             FLAG,
             "the goal that is being spoken",
             default=False,
-            help="Cancel the current sentence. The next one follows.",
+            help="Cancel only the current sentence. The next one follows.",
         ),
         Option(
             "before",
             ID,
-            "this goal, and all goals that were accepted before it",
+            "the goal with this id, and all goals that were accepted before it",
             help="Cancel this goal and all goals accepted before it.",
             completion="goal_ids",
         ),
@@ -644,7 +651,7 @@ class Cancel:
             "key",
             WORD,
             "the current and the waiting goals with this key",
-            help="Cancel all sentences with this key, spoken or waiting.",
+            help="Cancel the current and waiting sentences with this key.",
             completion="unfinished_keys",
         ),
     )
@@ -659,7 +666,7 @@ class Cancel:
         return self.ids is None and not self.current and self.before is None and self.key is None
 
     def select_waiting(self, goals: Sequence[Say]) -> list[int]:
-        """Return the indexes of the goals to cancel in a list of goals that wait for room in the queue.
+        """Return the indexes of the waiting goals that the request cancels.
 
         Such goals have an id only if their sender chose one, so `before` selects them only if it names such an id.
         """
@@ -673,7 +680,10 @@ class Cancel:
 
 
 def require_fields(cls: type, options: Iterable[str]) -> None:
-    """Raise TypeError if a class has no field for one of the options. Called when a module is imported."""
+    """Raise TypeError if a class has no field for one of the options.
+
+    Called when a module is imported.
+    """
     for name in options:
         if name not in cls.__annotations__:
             raise TypeError(f"{cls.__name__} has no field for the option {name!r}")
@@ -687,7 +697,7 @@ INITIAL = Set(**{each.name: each.setting.initial for each in SETTINGS if each.se
 
 
 def bad_option(request: Say | Set) -> str | None:
-    """Return an error message if a request contains a value that is not allowed, or None."""
+    """Return an error message if a request contains a value that is not allowed."""
     if isinstance(request, Say) and request.flush and request.preempt is False:
         return "flush can't be combined with preempt false, because it always interrupts"
     if isinstance(request, Say) and request.more and request.throttle is not None and request.key is None:
@@ -700,7 +710,7 @@ def bad_option(request: Say | Set) -> str | None:
 
 
 def bad_text(text: str, max_chars: int | None = MAX_TEXT_CHARS) -> Refusal | None:
-    """Return the reason why a text can't be spoken, or None if there is no obvious problem.
+    """Return the reason why a text can't be spoken, if there is an obvious one.
 
     Args:
         text: the text.
@@ -748,7 +758,10 @@ def bad_characters(text: str, max_chars: int | None, before_chars: int = 0) -> R
 
 
 def engine_options(say: Say, settings: Set) -> dict[str, Any]:
-    """Return the options that the engine needs for a goal, by name. Omitted options come from the settings."""
+    """Return the options that the engine needs for a goal, by name.
+
+    Omitted options come from the settings.
+    """
     found = {}
     for name in ENGINE_OPTIONS:
         own = getattr(say, name)
@@ -757,12 +770,12 @@ def engine_options(say: Say, settings: Set) -> dict[str, Any]:
 
 
 def shown_settings(settings: Set) -> JsonObject:
-    """Return settings for display, with None for the default voice and for an unlimited time to live."""
+    """Return settings for display, with None for the default voice and for no time limit."""
     return _replace_none_values(fields(settings))
 
 
 def _replace_none_values(values: dict[str, Any]) -> dict[str, Any]:
-    """Return a copy of settings or options in which values that mean "none" are None."""
+    """Return a copy of settings in which None replaces values that mean "none"."""
     return {name: None if value == _NONE_VALUES.get(name) else value for name, value in values.items()}
 
 

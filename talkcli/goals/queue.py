@@ -51,11 +51,17 @@ class Queue:
         return self._goals[0][2] if self._goals else None
 
     def with_key(self, key: str | None) -> Record | None:
-        """Return the pending goal with this key, if any. Two pending goals never have the same key."""
+        """Return the pending goal with this key, if any.
+
+        Two pending goals never have the same key.
+        """
         return None if key is None else self._by_key.get(key)
 
     def with_text(self, text: str) -> Record | None:
-        """Return the first goal with this text, or None. This is slow, because it checks every goal."""
+        """Return the first pending goal with this text, if any.
+
+        This is slow, because it checks every goal.
+        """
         return next((each for each in self if each.say.text == text), None)
 
     def goals_up_to(self, priority: int) -> list[Record]:
@@ -63,15 +69,18 @@ class Queue:
         return list(map(_record_of, self._goals[bisect_left(self._goals, (-priority,)) :]))
 
     def preempting_goals_up_to(self, priority: int) -> list[Record]:
-        """Return all goals that interrupt others (`preempt`) and have this priority or a lower one."""
+        """Return all preempting goals with this priority or a lower one."""
         return list(map(_record_of, self._preempting[bisect_left(self._preempting, (-priority,)) :]))
 
     def displaceable_goal(self) -> Record | None:
-        """Return the newest goal of the lowest priority, which is removed first if the queue is full, or None."""
+        """Return the newest goal of the lowest priority, if any.
+
+        It is removed first if the queue is full.
+        """
         return self._displaceable[-1][2] if self._displaceable else None
 
     def add(self, record: Record, replaced: Record | None = None) -> None:
-        """Add a goal behind the others of its priority, in front of them if it preempts, or in place of another.
+        """Add a goal at its place in the speaking order.
 
         Args:
             record: the new goal.
@@ -92,7 +101,7 @@ class Queue:
             del self._by_key[record.say.key]
 
     def next_expiry(self) -> float:
-        """Return the monotonic time at which the next goal expires, or inf if no goal can expire."""
+        """Return the monotonic time at which the next goal expires."""
         return self._expiries[0][0] if self._expiries else inf
 
     def expired(self, now: float) -> list[Record]:
@@ -100,7 +109,7 @@ class Queue:
         return list(map(_record_of, self._expiries[: bisect_left(self._expiries, (now, inf))]))
 
     def _entries(self, record: Record) -> Iterator[tuple[list[_Entry], _Entry]]:
-        """Yield every sorted list that a goal belongs to, together with the entry for that list."""
+        """Yield each sorted list that contains a goal, with the goal's entry."""
         entry = -record.say.priority, record.position, record
         yield self._goals, entry
         yield self._displaceable, (-record.say.priority, record.number, record)

@@ -14,7 +14,9 @@ _REJECTED, _ABORTED, _LOST = State.REJECTED, State.ABORTED, State.LOST
 
 
 class Reason(str, Enum):
-    """Machine-readable reason why a goal was rejected or didn't succeed. Its meaning never changes.
+    """Machine-readable reason why a goal was rejected or didn't succeed.
+
+    Its meaning never changes.
 
     `Goal.reason` is a plain string because a newer server may send a reason that this client doesn't know.
     """
@@ -30,25 +32,29 @@ class Reason(str, Enum):
         return reason
 
     CANCELED = "canceled", (_RECALLED, _PREEMPTED), "a client cancelled the goal"
-    PREEMPTED = "preempted", (_RECALLED, _PREEMPTED), "another goal with `preempt` or `flush` interrupted or removed it"
-    REPLACED = "replaced", (_RECALLED,), "a newer goal had the same key"
+    PREEMPTED = (
+        "preempted",
+        (_RECALLED, _PREEMPTED),
+        "a goal with `preempt` or `flush` interrupted or removed this goal",
+    )
+    REPLACED = "replaced", (_RECALLED,), "a newer goal with the same key replaced this goal"
     EXPIRED = (
         "expired",
         (_RECALLED,),
-        "the `ttl` was over before the goal started. If an engine crashed before the first word, the goal is PREEMPTED",
+        "the goal did not start within its `ttl`. If an engine crashed before the first word, the goal is PREEMPTED",
     )
     DISPLACED = (
         "displaced",
         (_RECALLED,),
-        "the queue was full, and a goal with a higher priority arrived, or with the same priority and `preempt`. The "
-        "newest goal with the lowest priority is removed",
+        "the queue was full, and a goal with a higher priority, or with the same priority and `preempt`, needed room. "
+        "The newest goal with the lowest priority is removed first",
     )
     SHUTDOWN = "shutdown", (_RECALLED, _PREEMPTED, _REJECTED), "the server was stopped"
     THROTTLED = "throttled", (_REJECTED,), "the goal repeats another goal too soon (`throttle`)"
     QUEUE_FULL = "queue_full", (_REJECTED,), "the queue was full, and the goal could not displace another one"
     INVALID_TEXT = "invalid_text", (_REJECTED,), "the text is empty or invisible, contains NUL, or is not valid Unicode"
     TEXT_TOO_LONG = "text_too_long", (_REJECTED,), "the text exceeds 10,000 characters (`--max-text`) or 40,000 bytes"
-    BAD_OPTION = "bad_option", (_REJECTED, _ABORTED), "an option is out of its range, or the driver refuses it"
+    BAD_OPTION = "bad_option", (_REJECTED, _ABORTED), "an option is out of range, or the driver rejects its value"
     UNKNOWN_VOICE = (
         "unknown_voice",
         (_REJECTED, _ABORTED),

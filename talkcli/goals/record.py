@@ -32,7 +32,7 @@ class Record:
     id: str
     #: number of the goal in the order of submission
     number: int
-    #: the client's request; if it has no time to live, the server's default is filled in
+    #: the client's request, with the default time to live filled in
     say: Say
     sender: Sender
     queued_at: float
@@ -44,7 +44,7 @@ class Record:
     #: hash of these characters if the text was dropped to free memory, otherwise None
     text_hash: int | None = None
     state: State = State.PENDING
-    #: sort position among the pending goals of the same priority, used only by the queue
+    #: position in the queue among the goals of the same priority
     position: int = 0
     reason: Reason | None = None
     by: By | None = None
@@ -88,7 +88,7 @@ class Record:
         return len(self.say.text.encode(errors="surrogatepass"))
 
     def change_state(self, state: State) -> None:
-        """Change the state of the goal. Raises IllegalTransition if the change isn't allowed."""
+        """Change the state of the goal, or raise IllegalTransition."""
         if state not in TRANSITIONS[self.state]:
             raise IllegalTransition(f"a goal can't change from {self.state.name} to {state.name}")
         self.state = state
@@ -98,13 +98,13 @@ class Record:
         self.text_hash, self.say = hash(self.say.text[: self.first_chars]), replace(self.say, text="")
 
     def was_sent_as(self, text: str) -> bool:
-        """Return whether the goal was sent with this text. If the text was dropped, compare hashes."""
+        """Return whether the goal was sent with this text."""
         if self.text_hash is not None:
             return hash(text) == self.text_hash
         return text == self.say.text[: self.first_chars]
 
     def snapshot(self, state: State | None = None) -> Goal:
-        """Return an immutable copy of the goal, with the current state or another one.
+        """Return an immutable copy of the goal.
 
         Args:
             state: the state to show instead of the current one. With PENDING, the copy shows the goal as it was

@@ -51,7 +51,7 @@ class Now:
 
 @frozen
 class StateChange:
-    """An effect for the caller to carry out: publish the new state of a goal."""
+    """An effect that publishes the new state of a goal."""
 
     record: Record
     state: State
@@ -74,7 +74,7 @@ class Order(Enum):
 
 @frozen
 class EngineOrder:
-    """An effect for the caller to carry out: send the engine an order."""
+    """An effect that gives the engine an order."""
 
     record: Record
     order: Order
@@ -130,11 +130,11 @@ class Scheduler:
         self.active: Record | None = None
         #: whether speech is paused
         self.paused = False
-        #: whether goals can start, even if each one fails at once because no engine can be started
+        #: whether goals can start, even if they fail at once without an engine
         self.has_engine = False
         #: goals whose sender left before their text ended
         self._orphans: list[Record] = []
-        #: whether `shutdown` was called; if so, new goals are rejected
+        #: whether `shutdown` was called, so that new goals are rejected
         self.closing = False
         #: whether an engine process is running that can load voices
         self._loads_voices = False
@@ -150,11 +150,14 @@ class Scheduler:
         return ([self.active] if self.active else []) + list(self.pending)
 
     def find(self, goal_id: str) -> Record | None:
-        """Return the goal with this id, or None. Goals that ended long ago are forgotten."""
+        """Return the goal with this id, or None if it is unknown."""
         return self._by_id.get(goal_id) or self.history.find(goal_id)
 
     def has_room(self, say: Say) -> bool:
-        """Return whether the queue has room for a goal, or can make room. A goal with a known id needs none."""
+        """Return whether the queue has or can make room for a goal.
+
+        A known id needs no room.
+        """
         attaches = say.id is not None and self.find(say.id) is not None
         return attaches or self._find_room(say) is not None
 
@@ -184,7 +187,9 @@ class Scheduler:
         canceled: By | None = None,
         waited_s: float = 0.0,
     ) -> tuple[Record, list[Effect]]:
-        """Reject a goal or add it to the queue, and start the next goal if possible.
+        """Reject a goal or add it to the queue.
+
+        Return its record, and the effects to carry out.
 
         Args:
             say: the goal.
@@ -222,7 +227,9 @@ class Scheduler:
         self._by_id[record.id] = record
         effects: list[Effect] = [StateChange(record, State.PENDING)]
         if by:
-            words = "it was cancelled first" if canceled else "it was cancelled before it arrived"
+            words = (
+                "the goal was cancelled before it started" if canceled else "the goal was cancelled before it arrived"
+            )
             return record, effects + self._end_unqueued(record, Reason.CANCELED, words, by, now)
         if expired:
             words = _expiry_message(record)
@@ -234,7 +241,9 @@ class Scheduler:
     def cancel(
         self, selection: Cancel, sender: Sender | None, now: Now, waiting: Collection[str | None] = ()
     ) -> Cancellation:
-        """End pending goals, have the engine stop the active goal, and remember cancels for unknown goals.
+        """Cancel the selected goals, and remember cancels for unknown ids.
+
+        The result contains the effects.
 
         Args:
             selection: the goals to cancel.
@@ -249,7 +258,9 @@ class Scheduler:
             self._early_cancels.add(goal_id, by, now.monotonic)
         for record in chosen:
             if record.state is State.PENDING:
-                result.effects += self._recall(record, Reason.CANCELED, "it was cancelled first", by, now)
+                result.effects += self._recall(
+                    record, Reason.CANCELED, "the goal was cancelled before it started", by, now
+                )
                 result.recalled.append(record)
             else:
                 result.effects += self._stop(record, Reason.CANCELED, by, now)
@@ -313,7 +324,9 @@ class Scheduler:
         return self._stop(record, Reason.BROKEN_OFF, None, now) if at_once else [EngineOrder(record, Order.APPEND)]
 
     def change_settings(self, changes: dict[str, object], now: Now) -> list[Effect]:
-        """Change the server's settings for goals that have not started, and request the new voice, if any.
+        """Change the settings for goals that have not started.
+
+        Return the effects.
 
         A new voice that failed to load earlier is loaded again.
         """
@@ -325,7 +338,7 @@ class Scheduler:
         return self.tick(now)  # the next goal may not have to wait for its voice any more
 
     def pause(self) -> list[Effect]:
-        """Pause the active goal. No other goal starts until `resume` is called."""
+        """Pause the active goal, and prevent others from starting."""
         if self.paused:
             return []
         self.paused = True
@@ -336,7 +349,7 @@ class Scheduler:
         return [EngineOrder(self.active, Order.HOLD)]
 
     def resume(self, now: Now) -> list[Effect]:
-        """Resume the paused goal, or start the next one."""
+        """End the pause, and resume the paused goal or start the next one."""
         if not self.paused:
             return []
         self.paused = False
@@ -347,7 +360,10 @@ class Scheduler:
         return [EngineOrder(self.active, Order.RESUME)]
 
     def shutdown(self, now: Now) -> list[Effect]:
-        """End all pending goals, stop the active goal, and reject new goals."""
+        """End all pending goals, and reject new ones.
+
+        The returned effects also stop the active goal.
+        """
         self.closing = True
         effects: list[Effect] = []
         for record in list(self.pending):
@@ -359,31 +375,44 @@ class Scheduler:
     # -- reports from the engine
 
     def engine_lost(self, now: Now) -> list[Effect]:
-        """Record that the engine process has exited. No goal starts until a new engine is ready."""
+        """Record that the engine process has exited.
+
+        Return warnings about voices.
+        """
         self.has_engine = self._loads_voices = False
         return [*self.voices.engine_lost(now.monotonic)]
 
     def engine_ready(self, now: Now) -> list[Effect]:
-        """Record that an engine is ready, start the next goal, and load the next voice that goals need."""
+        """Record that an engine is ready, and start the next goal."""
         self.has_engine = self._loads_voices = True
         for voice in (*self._needed_voices(), self.settings.voice or ""):
             self._request_voice(voice, now)
         return self._start_next(now) + self._order_next_voice(now)
 
     def engine_unavailable(self, now: Now) -> list[Effect]:
-        """Record that no engine can be started. From now on, goals fail at once instead of waiting."""
+        """Record that no engine can be started.
+
+        Return the effects.
+        """
         self.has_engine, self._loads_voices = True, False
         return self._start_next(now)
 
     def fail_next(self, message: str, now: Now) -> list[Effect]:
-        """Fail the next goal with this message, unless an engine is available. Called after a long wait for one."""
+        """Fail the next goal, unless an engine is available.
+
+        Called after a long wait for an engine.
+        """
         if self.has_engine:
             return []
         record, effects = self._activate_next(now)
         return effects + self.failed(record.id, Reason.ENGINE_FAILED, message, None, now) if record else effects
 
     def word_heard(self, goal_id: str, start: int, end: int, seconds: float) -> None:
-        """Record that a word of the active goal has started, so that all words before it were heard to their end.
+        """Record that a word of the active goal has started.
+
+        All words before it were heard to their end.
+
+        Raises IllegalTransition if the active goal has another id.
 
         Args:
             goal_id: the id of the goal.
@@ -413,18 +442,23 @@ class Scheduler:
         self._restart_stall(record, now)
 
     def voice_chosen(self, goal_id: str, voice: str, now: Now) -> list[Effect]:
-        """Record which voice speaks the active goal, and load the next voice if possible."""
+        """Record which voice speaks the active goal.
+
+        Return the order to load the next voice, if any.
+        """
         self._require_active(goal_id).voice = voice
         return self._order_next_voice(now)
 
     def output_changed(self, goal_id: str, output: Output | None) -> None:
-        """Record the audio output of the active goal, or None if it is unknown."""
+        """Record the audio output of the active goal."""
         self._require_active(goal_id).output = output
 
     def completed(
         self, goal_id: str, duration: float | None, now: Now, gaps: int = 0, gap_seconds: float = 0
     ) -> list[Effect]:
         """End the active goal as SUCCEEDED, because it was played to the end.
+
+        Return the effects.
 
         Args:
             goal_id: the id of the goal.
@@ -449,7 +483,9 @@ class Scheduler:
         return self._end(record, State.SUCCEEDED, None, words, None, now)
 
     def failed(self, goal_id: str, reason: Reason, message: str, duration: float | None, now: Now) -> list[Effect]:
-        """End the active goal as ABORTED after a failure, or as PREEMPTED if it was being stopped anyway.
+        """End the active goal as ABORTED, or as PREEMPTED if it was being stopped.
+
+        Return the effects.
 
         If the goal was being stopped, the failure has silenced it, so it ends PREEMPTED. It ends ABORTED only with the
         reason `not_silent`.
@@ -463,9 +499,9 @@ class Scheduler:
         return self._end(record, State.ABORTED, reason, f"speech failed: {message}", record.by, now)
 
     def stopped(self, goal_id: str, now: Now) -> list[Effect]:
-        """End the active goal as PREEMPTED, because it was stopped and the engine is silent.
+        """End the active goal as PREEMPTED, because it was stopped and is silent.
 
-        If it was stopped because its text is incomplete, it ends as ABORTED.
+        If it was stopped because its text is incomplete, it ends as ABORTED. Return the effects.
         """
         record = self._require_active(goal_id)
         if record.reason in {Reason.BROKEN_OFF, Reason.TEXT_STALLED}:
@@ -475,7 +511,9 @@ class Scheduler:
         return self._end(record, State.PREEMPTED, record.reason, "Talk preempted", record.by, now)
 
     def voice_load_ended(self, voice: str, error: str | None, now: Now, *, has_libraries: bool) -> list[Effect]:
-        """Record that a voice was loaded or couldn't be. Start the next goal if it waited for this voice.
+        """Record that loading a voice succeeded or failed.
+
+        Return the effects, such as starting a waiting goal.
 
         Args:
             voice: the id of the voice.
@@ -488,7 +526,9 @@ class Scheduler:
         return self._order_voice_drops() + self.tick(now)
 
     def voices_measured(self, voice: str, memory_bytes: int, now: Now) -> list[Effect]:
-        """Record how much memory all neural voices use, and order the engine to drop or load voices.
+        """Record how much memory all neural voices use.
+
+        Return the orders to drop or load voices.
 
         Args:
             voice: the voice that was just loaded or has just spoken, or "" if a voice was dropped.
@@ -499,19 +539,22 @@ class Scheduler:
         return self._order_voice_drops() + self._order_next_voice(now)
 
     def voice_unloaded(self, voice: str, now: Now) -> list[Effect]:
-        """Record that the engine has dropped a voice without being told to, and load the next voice."""
+        """Record that the engine dropped a voice on its own.
+
+        Return the order to load the next voice, if any.
+        """
         self.voices.unloaded(voice, self._needed_voices())
         return self._order_next_voice(now)
 
     # -- time limits
 
     def deadline(self) -> float:
-        """Return the monotonic time at which `tick` must be called, or inf if there is no time limit."""
+        """Return the monotonic time at which `tick` must be called next."""
         orphans = min((each.orphaned_until for each in self._orphans), default=inf)
         return min(self._active_deadline(), self.pending.next_expiry(), self._next_deadline(), orphans)
 
     def tick(self, now: Now) -> list[Effect]:
-        """Handle the time limits that have been reached: end expired goals, and start the next one if possible.
+        """Handle all time limits that have been reached.
 
         Expired goals are recalled. If the active goal was stopped and did not become silent in time, it is aborted. The
         next goal starts if it no longer has to wait for its voice.
@@ -523,7 +566,9 @@ class Scheduler:
                 stalled = now.monotonic >= record.stalls_at
                 effects = self._stop(record, Reason.TEXT_STALLED if stalled else Reason.EXPIRED, None, now)
             else:
-                words = f"speech failed: it was stopped, but silence was not confirmed within {CONFIRM_SILENCE_S:g} s"
+                words = (
+                    f"speech failed: the goal was stopped, but silence was not confirmed within {CONFIRM_SILENCE_S:g} s"
+                )
                 effects = [EngineOrder(record, Order.GIVE_UP)]
                 effects += self._end(record, State.ABORTED, Reason.NOT_SILENT, words, record.by, now)
         for each in [each for each in self._orphans if now.monotonic >= each.orphaned_until]:
@@ -533,7 +578,7 @@ class Scheduler:
     # -- selecting and accepting goals
 
     def _select(self, selection: Cancel, result: Cancellation, waiting: Collection[str | None]) -> list[Record]:
-        """Return the unfinished goals that a cancel selects, and add ended goals and unknown ids to `result`."""
+        """Return the unfinished goals that a cancel selects, and record ended and unknown ones in `result`."""
         chosen = self.unfinished() if selection.selects_all else []
         for goal_id in dict.fromkeys(selection.ids or ()):
             record = self.find(goal_id)
@@ -558,7 +603,9 @@ class Scheduler:
         return sorted(unique, key=lambda each: (each is self.active, each.number))
 
     def _find_refusal(self, say: Say, refusal: Refusal | None, same_id: Record | None) -> Refusal | None:
-        """Return the reason why a goal must be rejected, or None. The state of the queue doesn't matter.
+        """Return the reason why a goal must be rejected, if there is one.
+
+        The state of the queue doesn't matter.
 
         Args:
             say: the goal.
@@ -575,7 +622,9 @@ class Scheduler:
         return options.bad_text(say.text, limit) or refusal
 
     def _throttle(self, say: Say, record: Record, now: Now) -> Refusal | None:
-        """Return the reason to reject a goal that repeats another too soon, and set `record.by`, or return None.
+        """Return a refusal if a goal repeats another one too soon.
+
+        May set `record.by`.
 
         If the goal is rejected, `record.by` is set to the other goal.
         """
@@ -597,11 +646,11 @@ class Scheduler:
         return Reason.THROTTLED, f"{what} {words}"
 
     def _preempts(self, say: Say) -> bool:
-        """Return whether a goal interrupts others, by its own options or by the server's setting."""
+        """Return whether a goal interrupts others."""
         return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)
 
     def _find_room(self, say: Say) -> list[tuple[Record, Reason]] | None:
-        """Return the goals that a new goal would remove from the queue, with reasons, or None if it doesn't fit."""
+        """Return the goals that a new goal would remove from the queue."""
         replaced = self.pending.with_key(say.key)
         preempted: list[Record] = []
         if say.flush:
@@ -619,7 +668,10 @@ class Scheduler:
         return [(last, Reason.DISPLACED)] if last and last.say.priority <= limit else None
 
     def _enqueue(self, record: Record, recalled: list[tuple[Record, Reason]], now: Now) -> list[Effect]:
-        """Add a goal to the queue, recall the given goals, and stop the active goal if it is preempted."""
+        """Add a goal to the queue, and recall the given goals.
+
+        The returned effects stop a preempted active goal.
+        """
         by = By(goal=record.id)
         effects: list[Effect] = []
         replaced = None
@@ -649,7 +701,9 @@ class Scheduler:
         return list(filter(options.is_neural, dict.fromkeys(voices)))
 
     def _order_next_voice(self, now: Now) -> list[Effect]:
-        """Choose the next voice to load, record that it is loading, and return the order in a list, if any.
+        """Choose the next voice to load, and mark it as loading.
+
+        Return a list with the order, if any.
 
         The first voice is not loaded while a goal is active. Loading it imports libraries, which blocks the engine
         process for a tenth of a second.
@@ -664,7 +718,7 @@ class Scheduler:
         return [order] if order else []
 
     def _order_voice_drops(self) -> list[Effect]:
-        """Return orders to drop voices if they use too much memory, and record them as dropped."""
+        """Drop voices if they use too much memory, and return the orders."""
         needed = self._needed_voices()
         speaking = options.without_speaker(self.active.voice) if self.active else ""
         if options.is_neural(speaking) and not self.voices.is_loaded(speaking):
@@ -674,14 +728,14 @@ class Scheduler:
     # -- starting and ending goals
 
     def _expire(self, now: Now) -> list[Effect]:
-        """End all pending goals that have expired as RECALLED."""
+        """Recall all pending goals that have expired."""
         effects: list[Effect] = []
         for record in self.pending.expired(now.monotonic):
             effects += self._recall(record, Reason.EXPIRED, _expiry_message(record), None, now)
         return effects
 
     def _active_deadline(self) -> float:
-        """Return the monotonic time by which the active goal must be silent, or at which it expires, or inf.
+        """Return the monotonic time of the active goal's next time limit.
 
         If the goal is being stopped, it must be silent by then. Otherwise, it expires then, but only if the engine was
         lost before anything was heard, because the goal must start again.
@@ -696,25 +750,30 @@ class Scheduler:
         return inf if self.has_engine or goal.begun_end else goal.expires_at
 
     def _next_deadline(self) -> float:
-        """Return the monotonic time at which `tick` must try to start the next goal, or inf if none can start."""
+        """Return the monotonic time at which to try to start the next goal."""
         record = None if self.active or self.paused or not self.has_engine else self.pending.first()
         if record is None:
             return inf
         return 0.0 if record.next_since == inf else self._start_time(record)
 
     def _start_time(self, record: Record) -> float:
-        """Return the monotonic time until which a goal waits for its voice, or 0 if it doesn't wait."""
+        """Return the monotonic time until which a goal waits for its voice."""
         return self.voices.start_time(record, self.settings.voice) if self._loads_voices else 0.0
 
     def _start_next(self, now: Now) -> list[Effect]:
-        """Make the next goal ACTIVE and return the order to speak it, if there is an engine and a goal can start."""
+        """Start the next goal if possible.
+
+        Return the effects, including the order to speak it.
+        """
         if not self.has_engine:
             return []
         record, effects = self._activate_next(now)
         return [*effects, EngineOrder(record, Order.START)] if record else effects
 
     def _activate_next(self, now: Now) -> tuple[Record | None, list[Effect]]:
-        """Make the next goal ACTIVE if it can start, and return it with the effects, but no order to the engine.
+        """Make the next goal ACTIVE if possible.
+
+        Return it, and the effects without the order to speak it.
 
         Return None instead of a goal if no goal can start now.
         """
@@ -734,17 +793,17 @@ class Scheduler:
         return record, [*effects, StateChange(record, State.ACTIVE)]
 
     def _recall(self, record: Record, reason: Reason, details: str, by: By | None, now: Now) -> list[Effect]:
-        """Remove a goal from the queue and end it with the state RECALLED."""
+        """Remove a goal from the queue, and end it as RECALLED."""
         self.pending.remove(record)
         return self._end_unqueued(record, reason, details, by, now)
 
     def _end_unqueued(self, record: Record, reason: Reason, details: str, by: By | None, now: Now) -> list[Effect]:
-        """End a pending goal that is not in the queue with the state RECALLED."""
+        """End a pending goal as RECALLED after it has left the queue."""
         record.change_state(State.RECALLING)
         return self._end(record, State.RECALLED, reason, f"not spoken: {details}", by, now)
 
     def _stop(self, record: Record, reason: Reason, by: By | None, now: Now) -> list[Effect]:
-        """Make the active goal PREEMPTING and return the order to stop it, unless it is already being stopped."""
+        """Stop the active goal, unless it is already being stopped."""
         if record.state is State.PREEMPTING:
             return []  # keep the reason for the first stop
         record.change_state(State.PREEMPTING)
@@ -763,7 +822,7 @@ class Scheduler:
         record.stalls_at = now.monotonic + record.say.stall if record.waits else inf
 
     def _require_active(self, goal_id: str) -> Record:
-        """Return the active goal. Raises IllegalTransition if it doesn't have this id."""
+        """Return the active goal, which must have this id."""
         if self.active is None or self.active.id != goal_id:
             raise IllegalTransition(f"goal {goal_id} is not being spoken")
         return self.active
@@ -771,7 +830,10 @@ class Scheduler:
     def _end(
         self, record: Record, state: State, reason: Reason | None, message: str, by: By | None, now: Now
     ) -> list[Effect]:
-        """Set a goal's final state and move it to the history. If it was the active goal, start the next one."""
+        """Set a goal's final state, and move it to the history.
+
+        Return the effects, such as starting the next goal.
+        """
         record.change_state(state)
         record.reason, record.message, record.by = reason, message, by
         record.ended_at, record.paused, record.more, record.waits = now.wall, False, False, False
@@ -787,5 +849,5 @@ class Scheduler:
 
 
 def _expiry_message(record: Record) -> str:
-    """Return a message saying that a goal's time to live was over."""
+    """Return the message for a goal whose time to live is over."""
     return f"its ttl of {options.format_number(record.say.ttl)} s was over"

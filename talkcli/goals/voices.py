@@ -33,7 +33,7 @@ MAX_ENGINE_DEATHS = 2
 
 
 class VoiceState(Enum):
-    """The state of a neural voice."""
+    """The progress of loading a neural voice."""
 
     WAITING = "waiting"  # not yet loaded
     LOADING = "loading"
@@ -68,7 +68,7 @@ class NeuralVoice:
 
 @frozen
 class VoiceLoadOrder:
-    """An effect for the caller to carry out: have the engine load a voice, after unloading some others."""
+    """An effect that makes the engine load a voice, after unloading some others."""
 
     voice: str
     dropped: tuple[str, ...] = ()
@@ -76,14 +76,14 @@ class VoiceLoadOrder:
 
 @frozen
 class VoiceDropOrder:
-    """An effect for the caller to carry out: have the engine unload a voice to save memory."""
+    """An effect that makes the engine unload a voice to save memory."""
 
     voice: str
 
 
 @frozen
 class VoiceWarning:
-    """An effect for the caller to carry out: log a problem with a voice."""
+    """An effect that logs a problem with a voice."""
 
     message: str
 
@@ -108,7 +108,7 @@ class VoiceScheduler:
         self._reported_bytes = 0
         #: estimated memory use of all voices, without those dropped since the last report
         self._used_bytes = 0
-        #: whether the engine has imported the libraries for neural voices, which it does with the first voice
+        #: whether the engine has imported the libraries for neural voices
         self.has_libraries = False
         #: the voice that the engine is loading
         self._loading: str | None = None
@@ -116,7 +116,10 @@ class VoiceScheduler:
     # -- requests from goals
 
     def request(self, voice: str, now: float) -> None:
-        """Record that a goal asks for a voice, and plan to load it. A failed voice is retried after a delay."""
+        """Record that a goal asks for a voice, and plan to load it.
+
+        A failed voice is retried after a delay.
+        """
         found = self._voices.pop(voice, None) or self._new_voice(voice)
         self._voices[voice] = found
         if found.state is VoiceState.FAILED and voice != self._loading and now >= found.retry_at:
@@ -129,10 +132,10 @@ class VoiceScheduler:
             del self._voices[voice]
 
     def start_time(self, record: Record, default_voice: str | None) -> float:
-        """Return the monotonic time until which the next goal waits for its voice, or 0 if it doesn't wait.
+        """Return the monotonic time until which the next goal waits for its voice.
 
-        Urgent goals don't wait. Other goals stop waiting before they expire. A `voice_only` goal waits until its voice
-        is loaded or has failed.
+        Return 0 if it doesn't wait. Urgent goals don't wait. Other goals stop waiting before they expire. A
+        `voice_only` goal waits until its voice is loaded or has failed.
 
         Args:
             record: the next goal.
@@ -149,7 +152,7 @@ class VoiceScheduler:
         return min(start, record.expires_at - EXPIRY_MARGIN_S)
 
     def failure(self, voice: str) -> str | None:
-        """Return the reason why a voice could not be loaded, or None if it didn't fail."""
+        """Return the reason why a voice could not be loaded, if it failed."""
         found = self._voices.get(voice)
         return found.why if found and found.state is VoiceState.FAILED else None
 
@@ -165,7 +168,7 @@ class VoiceScheduler:
         return self._loading is None and any(each.wanted for each in self._voices.values())
 
     def load_next(self, needed: Sequence[str], default_voice: str, now: float) -> VoiceLoadOrder | None:
-        """Choose the next voice to load, record that it is loading, and return the order, or None.
+        """Choose the next voice to load, and return the order.
 
         Call this only if `can_load` is true. A loaded voice is not dropped if a goal needs it sooner than the next
         voice, because it would have to be loaded again.
@@ -194,7 +197,9 @@ class VoiceScheduler:
         return None
 
     def drop_excess(self, first: str, needed: Sequence[str]) -> list[VoiceDropOrder | VoiceWarning]:
-        """Drop voices until the others fit into the memory limit, and return orders and warnings.
+        """Choose the voices to drop to meet the memory limit.
+
+        Return the orders to drop them, and any warnings.
 
         This is necessary if the voices use more memory than was estimated.
 
@@ -245,7 +250,10 @@ class VoiceScheduler:
             self._measured_bytes[voice] = found.size_bytes
 
     def unloaded(self, voice: str, needed: Collection[str]) -> None:
-        """Record that the engine has dropped a voice. If a goal needs it, plan to load it again."""
+        """Record that the engine has dropped a voice.
+
+        If a goal needs it, plan to load it again.
+        """
         found = self._voices.pop(voice, None)
         if found and found.state is VoiceState.LOADED:
             self._used_bytes = max(0, self._used_bytes - found.size_bytes)  # estimated until the next measurement
@@ -253,7 +261,7 @@ class VoiceScheduler:
             self._voices[voice] = NeuralVoice(found.size_bytes)
 
     def engine_lost(self, now: float) -> list[VoiceWarning]:
-        """Record that the engine process has exited, and return a warning if loading a voice was the likely cause."""
+        """Record that the engine process has exited, and warn if a voice is the likely cause."""
         suspect, self._loading, self.has_libraries = self._loading, None, False
         self._reported_bytes = self._used_bytes = 0
         for voice, found in list(self._voices.items()):
@@ -277,13 +285,13 @@ class VoiceScheduler:
         return {voice: each.size_bytes for voice, each in self._voices.items() if each.state is VoiceState.LOADED}
 
     def _total_bytes(self) -> int:
-        """Return the memory use of all voices together, including memory that belongs to no loaded voice."""
+        """Return the total memory use of all voices."""
         return max(self._used_bytes, sum(self._loaded_bytes().values()))
 
     def _voices_to_drop(self, size_bytes: int, keep: Collection[str]) -> tuple[str, ...] | None:
-        """Return the voices to drop to make room for a new one, or None if it can't fit.
+        """Return the voices to drop to make room for a new one.
 
-        The least recently used voices are dropped first.
+        Return None if it can't fit. The least recently used voices are dropped first.
 
         Args:
             size_bytes: the memory use of the new voice.
@@ -298,7 +306,7 @@ class VoiceScheduler:
         return None if keep and total > self._limit_bytes else tuple(dropped)
 
     def _warn_too_large(self) -> list[VoiceWarning]:
-        """Return a warning if the only loaded voice exceeds the memory limit, but only once for each voice."""
+        """Return a warning if the only loaded voice exceeds the memory limit."""
         loaded = self._loaded_bytes()
         voice = next(iter(loaded), "")
         taken = self._total_bytes()
@@ -317,5 +325,5 @@ class VoiceScheduler:
                     del self._voices[voice]
 
     def _new_voice(self, voice: str) -> NeuralVoice:
-        """Return a new entry for a voice that is not loaded, with its measured or estimated size."""
+        """Create the entry for a voice that is not loaded yet."""
         return NeuralVoice(self._measured_bytes.get(voice) or self._file_size(voice))

@@ -48,7 +48,10 @@ class ServerStatus:
 
     @classmethod
     def from_json(cls, message: JsonObject) -> ServerStatus:
-        """Read a status from its JSON object. Raises Unreadable if one of the goals is malformed."""
+        """Read a status from its JSON object.
+
+        Raises Unreadable if one of the goals is malformed.
+        """
         server, pending, recent = message.get("server"), message.get("pending"), message.get("recent")
         return cls(
             server if isinstance(server, dict) else {},
@@ -59,7 +62,7 @@ class ServerStatus:
 
     @classmethod
     def from_reply(cls, reply: JsonObject, items: list[JsonObject]) -> ServerStatus:
-        """Read a status from a reply and from the list items that preceded it."""
+        """Read a status from a reply and its list items."""
         lists = {name: [each[name] for each in items if name in each] for name in ("pending", "recent")}
         return cls.from_json({**reply, **lists})
 
@@ -95,7 +98,7 @@ class StateChanged:
     #: the number of the event. A number is skipped if its event was for another client, or if a word was dropped
     #: because this client reads slowly.
     n: int | None = None
-    #: the whole goal. Only clients that watch all goals receive it, with the goal's first and last state.
+    #: the whole goal, which only clients that watch all goals receive, in a goal's first and last event
     goal: Goal | None = None
 
     def to_json(self) -> JsonObject:
@@ -186,7 +189,10 @@ class Result:
 
 @frozen
 class Snapshot:
-    """Event sent when a client starts to watch. It has the state of the server and of all goals."""
+    """Event sent when a client starts to watch.
+
+    It has the state of the server and of all goals.
+    """
 
     status: ServerStatus
 
@@ -232,18 +238,27 @@ def from_json(message: JsonObject) -> Event | None:
 
 
 def _event_json(kind: str, event: StateChanged | WordHeard | TextAdded | TextMissing | PausedChanged) -> JsonObject:
-    """Return an event's JSON object, without its goal."""
+    """Return the fields of an event's JSON object, except its goal.
+
+    The caller converts enums and objects.
+    """
     own = {name: value for name, value in fields(event).items() if name not in {"at", "n", "goal"}}
     return {"event": kind, **own, "n": event.n, "at": event.at}
 
 
 def goals(items: list[JsonObject], name: str) -> Iterator[Goal]:
-    """Yield the goals in the field `name` of list items. Raises Unreadable if a goal is malformed."""
+    """Yield the goals in the given field of list items.
+
+    Raises Unreadable if a goal is malformed.
+    """
     return (Goal.from_json(each[name]) for each in items if name in each)
 
 
 def goal_in(reply: JsonObject, name: str = "goal") -> Goal | None:
-    """Read a goal from a reply, or return None if the field is null. Raises Unreadable if the goal is malformed."""
+    """Read a goal from a reply, or return None if the field is null.
+
+    Raises Unreadable if the goal is malformed.
+    """
     return None if reply.get(name) is None else Goal.from_json(reply[name])
 
 
@@ -261,7 +276,7 @@ def busy_greeting(message: str | None = None) -> JsonObject:
 
 
 def check_greeting(message: JsonObject) -> None:
-    """Raise ProtocolMismatch or Busy if a greeting shows that this client can't use the server."""
+    """Raise an error if a greeting shows that this client can't use the server."""
     theirs = message.get("talk")
     if theirs != PROTOCOL or isinstance(theirs, bool):
         server = ascii(message.get("version", "unknown"))
@@ -279,22 +294,28 @@ def check_greeting(message: JsonObject) -> None:
 
 
 def item(seq: int | None, **fields: object) -> JsonObject:
-    """Return the message for one item of a list, with these fields. The items are sent before the reply."""
+    """Return the message for one item of a list.
+
+    The items are sent before the reply.
+    """
     return fields if seq is None else {"seq": seq, **fields}
 
 
 def ok(seq: int | None, **fields: object) -> JsonObject:
-    """Return the reply to a request that succeeded, with these fields."""
+    """Return the reply to a successful request."""
     return item(seq, ok=True, **fields)
 
 
 def failure(seq: int | None, code: str, message: str, **fields: object) -> JsonObject:
-    """Return the reply to a request that failed, with an error code, a message for the user, and these fields."""
+    """Return the reply to a failed request."""
     return item(seq, ok=False, error={"code": code, "message": message}, **fields)
 
 
 def take_seq(message: JsonObject) -> int | None:
-    """Remove the `seq` number from a request, and return it, or None. Raises BadRequest if it isn't an integer."""
+    """Remove and return a request's `seq` number, if it has one.
+
+    Raises BadRequest if it isn't an integer.
+    """
     seq = message.pop("seq", None)
     if seq is not None and (isinstance(seq, bool) or not isinstance(seq, int)):
         raise BadRequest("'seq' must be an integer", "bad_field")

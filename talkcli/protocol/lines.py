@@ -30,14 +30,17 @@ MAX_DIGITS = 20
 
 
 class TruncatedLine(bytes):
-    """The beginning of a line that is longer than the limit of its `LineSplitter`."""
+    """The beginning of a line that is too long."""
 
     #: length of the complete line in bytes
     size: int
 
 
 class LineSplitter:
-    """Splits a stream of bytes into lines. It keeps at most the first `max_bytes` bytes of a line."""
+    """Splits a stream of bytes into lines.
+
+    It keeps at most the first `max_bytes` bytes of a line.
+    """
 
     __slots__ = ("_max_bytes", "_rest", "size")
 
@@ -48,7 +51,7 @@ class LineSplitter:
         self.size = 0
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Add received bytes, and return the lines that are now complete, without their newlines.
+        """Add received bytes, and return the lines that are now complete.
 
         A line that is too long is truncated.
         """
@@ -61,7 +64,7 @@ class LineSplitter:
         return lines
 
     def take_rest(self) -> bytes:
-        """Remove and return the incomplete line, or return b"" if there is none."""
+        """Remove and return the incomplete line."""
         line = bytes(self._rest)
         if self.size > self._max_bytes:
             line = TruncatedLine(line)
@@ -77,7 +80,7 @@ class LineSplitter:
 
 
 def write_request(request: Request) -> JsonObject:
-    """Return a request's JSON object, without the fields that have their default value."""
+    """Return a request's JSON object, without the default values."""
     message: JsonObject = {"request": request.kind}
     for option in request.options:
         value = getattr(request, option.name)
@@ -87,7 +90,7 @@ def write_request(request: Request) -> JsonObject:
 
 
 def request_line(message: JsonObject) -> bytes:
-    """Encode an object as a line of JSON, without importing `json` if all values are simple."""
+    """Encode an object as a line of JSON, without importing `json` if possible."""
     try:
         shown = ", ".join(f'"{name}": {_encode_simple(value)}' for name, value in message.items())
         return f"{{{shown}}}\n".encode()
@@ -96,7 +99,10 @@ def request_line(message: JsonObject) -> bytes:
 
 
 def _encode_simple(value: object) -> str:
-    """Encode a simple value as JSON. Raises TypeError if the value needs the `json` module."""
+    """Encode a simple value as JSON.
+
+    Raises TypeError if the value needs the `json` module.
+    """
     if isinstance(value, str):
         if value.isprintable() and '"' not in value and "\\" not in value:
             return f'"{value}"'
@@ -115,7 +121,9 @@ def _encode_simple(value: object) -> str:
 
 
 def encode(message: JsonObject) -> bytes:
-    """Encode an object as a line of JSON. Raises ValueError or TypeError if that is impossible.
+    """Encode an object as a line of JSON.
+
+    Raises ValueError or TypeError if that is impossible.
 
     Text is written as UTF-8. Only lone surrogates, which UTF-8 can't hold, are escaped.
     """
@@ -127,7 +135,10 @@ def encode(message: JsonObject) -> bytes:
 
 
 def decode(line: bytes) -> JsonObject:
-    """Decode the JSON object in a line. Raises BadRequest if the line is malformed or too long."""
+    """Decode the JSON object in a line.
+
+    Raises BadRequest if the line is malformed or too long.
+    """
     from talkcli.errors import BadRequest, LineTooLong
 
     if isinstance(line, TruncatedLine):
@@ -151,7 +162,10 @@ _json_functions: dict[str, Callable[[Any], Any]] = {}
 
 
 def _json_function(name: str) -> Callable[[Any], Any]:
-    """Return the JSON function called `decode`, `encode` or `escape`. The first call creates all three."""
+    """Return the JSON function called `decode`, `encode` or `escape`.
+
+    The first call creates all three.
+    """
     if not _json_functions:
         import json
 
@@ -167,7 +181,10 @@ def _json_function(name: str) -> Callable[[Any], Any]:
 
 
 def _create_object(pairs: list[tuple[str, object]]) -> JsonObject:
-    """Return an object with these keys and values. Raises ValueError if a key appears twice."""
+    """Return an object with the given keys and values.
+
+    Raises ValueError if a key appears twice.
+    """
     fields = dict(pairs)
     if len(fields) != len(pairs):
         raise ValueError("a key appears twice")
@@ -180,14 +197,17 @@ def _refuse_constant(name: str) -> object:
 
 
 def _parse_integer(digits: str) -> int:
-    """Convert the digits of an integer. Raises ValueError if there are too many."""
+    """Convert a string of digits to an integer.
+
+    Raises ValueError if the string is too long.
+    """
     if len(digits) > MAX_DIGITS:
         raise ValueError(f"an integer has {len(digits):,} digits (at most {MAX_DIGITS})")
     return int(digits)
 
 
 def _parse_float(digits: str) -> float:
-    """Convert the digits of a float. Raises ValueError if the number is too large for a float."""
+    """Convert a string to a float. Raises ValueError if the number is too large."""
     number = float(digits)
     if not _is_finite(number):
         raise ValueError("a number is too large")

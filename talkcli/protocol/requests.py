@@ -3,7 +3,7 @@
 Rules for this file: it only defines the form of requests. The scheduler decides whether a goal is admitted. A request
 is a class with a row for each of its fields. The classes of `say`, `append`, `cancel` and `set` are in `goals.options`.
 Fields may be added, but never renamed or given another meaning. A field without a row is refused and never ignored,
-because a client must know that a server doesn't support it. `meaning` is the text in the wire's table.
+because a client must know that a server doesn't support it. `meaning` is shown in the protocol's document.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ if TYPE_CHECKING:
 
 
 def _sender_name_error(value: str) -> str | None:
-    """Return an error message if a client's name is empty or too long, or None."""
+    """Return an error message if a client's name is empty or too long."""
     return None if 0 < len(value) <= MAX_SENDER_NAME_CHARS else f"must have 1 to {MAX_SENDER_NAME_CHARS} characters"
 
 
 def _log_count_error(value: int) -> str | None:
-    """Return an error message if the `count` of a `log` request is out of range, or None."""
+    """Return an error message if the `count` of a `log` request is out of range."""
     return None if 0 < value <= MAX_LOG_GOALS else f"must be 1 to {MAX_LOG_GOALS:,}"
 
 
@@ -47,7 +47,7 @@ _COUNT_TYPE = Kind("integer", (int,), "must be an integer", check=_log_count_err
 
 @frozen
 class Hello:
-    """The first message of a client, with its name and whether it will send only urgent requests."""
+    """The first message of a client, which gives its name."""
 
     kind: ClassVar[str] = "hello"
     meaning: ClassVar[str] = "Identify the client. Send this first"
@@ -56,7 +56,7 @@ class Hello:
         Option(
             "urgent",
             FLAG,
-            "only `status` and `cancel` will follow; a full server keeps some places for such clients",
+            "the client only sends `status` and `cancel`; a full server still accepts a few such clients",
             default=False,
         ),
     )
@@ -66,7 +66,10 @@ class Hello:
 
 @frozen
 class Wait:
-    """A request for the results of the named goals, or of all unfinished goals. Any client may have sent them."""
+    """A request for the results of the named goals, or of all unfinished goals.
+
+    Any client may have sent them.
+    """
 
     kind: ClassVar[str] = "wait"
     meaning: ClassVar[str] = "Send the results of these goals, whoever sent them"
@@ -113,7 +116,7 @@ class Log:
     """A request for the most recently ended goals, oldest first."""
 
     kind: ClassVar[str] = "log"
-    meaning: ClassVar[str] = "List the last goals that ended, including REJECTED ones, oldest first"
+    meaning: ClassVar[str] = "List the most recently ended goals, including REJECTED goals, oldest first"
     options: ClassVar[tuple[Option, ...]] = (
         Option("count", _COUNT_TYPE, "the maximum number of goals", 20, form=f"1 to {MAX_LOG_GOALS:,}"),
     )
@@ -144,7 +147,7 @@ REQUEST_TYPES: dict[str, type[Request]] = {each.kind: each for each in Request._
 
 
 def read_request(message: JsonObject) -> Request:
-    """Check a request's JSON object, which must not contain `seq`, and return the request.
+    """Check a JSON object, and return the request in it.
 
     Raises:
         BadRequest: the request is malformed.

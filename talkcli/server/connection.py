@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 #: A client with more unread output than this is disconnected.
 MAX_CLIENT_OUTPUT_BYTES = 4 * 1024 * 1024
-#: A client is disconnected if more messages than this have to wait while a list is sent to it.
+#: Maximum number of messages that wait while a list is sent to a client. With more, the client is disconnected.
 MAX_HELD_MESSAGES = 10_000
 #: Time limit for a client's first request. Clients send `hello` immediately.
 FIRST_REQUEST_S = 5.0
@@ -58,13 +58,13 @@ class Handler(Protocol):
     greeting: bytes
 
     def joined(self, connection: ClientConnection) -> None:
-        """Identify a new client, and then admit it, keep it waiting, or refuse it."""
+        """Admit a new client, keep it waiting, or refuse it."""
 
     def left(self, connection: ClientConnection) -> None:
         """Remove a client that has disconnected."""
 
     def handle(self, connection: ClientConnection, seq: int | None, request: Request) -> None:
-        """Start to carry out a client's request. The reply may be sent later."""
+        """Start to carry out a client's request."""
 
     def input_ended(self, connection: ClientConnection) -> None:
         """Break off the texts that a client has not completed, because it will send nothing more."""
@@ -85,7 +85,7 @@ class PendingRequest:
         self.connection = connection
         self.seq = seq
         self.request = request
-        #: the list that the request waits in, or None
+        #: the waiting list that contains the request, or None
         self.waiting_list: WaitingList | None = None
         #: memory counted for the request while it waits
         self.kept_bytes = 0
@@ -98,7 +98,10 @@ class PendingRequest:
         self._steps: Steps
 
     def start(self, steps: Steps) -> None:
-        """Run the coroutine until it waits or ends. It must answer the request and must not raise."""
+        """Run the coroutine until it waits or ends.
+
+        It must answer the request and must not raise.
+        """
         self._steps = steps
         self._step(None)
 
@@ -112,7 +115,7 @@ class PendingRequest:
                 timer.cancel()
 
     def resume(self, in_time: bool = True) -> None:
-        """Continue the request if it is waiting. Its call of `wait` returns `in_time`."""
+        """Continue the request if it is waiting."""
         if self._leave():
             self._step(in_time)
 
@@ -128,7 +131,7 @@ class PendingRequest:
         self._steps.close()
 
     def answer(self, items: Iterable[JsonObject] = (), events: Iterable[JsonObject] = (), /, **fields: object) -> None:
-        """Send a successful reply, with list items before it and events after it.
+        """Reply that the request succeeded.
 
         Args:
             items: the lines of a list to send before the reply.
@@ -138,7 +141,7 @@ class PendingRequest:
         self._reply(ok(self.seq, **fields), items, events)
 
     def refuse(self, code: str, message: str, items: Iterable[JsonObject] = (), **fields: object) -> None:
-        """Send an error reply, with list items before it.
+        """Reply that the request failed.
 
         Args:
             code: the machine-readable error.
@@ -157,12 +160,12 @@ class PendingRequest:
             self.connection.send(reply)
 
     def _step(self, value: bool | None) -> None:
-        """Continue the coroutine with this value until it waits in a list or ends."""
+        """Continue the coroutine until it waits in a list or ends."""
         with contextlib.suppress(StopIteration):  # raised when the coroutine has ended
             self.move_to(self._steps.send(value))
 
     def _leave(self) -> bool:
-        """Remove the request from its waiting list. Return False if it wasn't waiting."""
+        """Remove the request from its waiting list, if it is waiting."""
         if self.waiting_list is None:
             return False
         del self.waiting_list[self]
@@ -178,7 +181,10 @@ def resume_all(waiting_list: WaitingList) -> None:
 
 @coroutine
 def _wait_in(waiting_list: WaitingList) -> Generator[WaitingList, bool, bool]:
-    """Suspend a request's coroutine until it is resumed from this list. Return whether that was in time."""
+    """Suspend a request's coroutine until it is resumed from this list.
+
+    Return whether that was in time.
+    """
     return (yield waiting_list)
 
 
@@ -233,7 +239,7 @@ class ClientConnection(asyncio.Protocol):
     # -- called by the stream
 
     def connection_lost(self, error: Exception | None) -> None:
-        """Process the last requests if the connection broke, and remove the client from the server."""
+        """Remove the client from the server after its connection has ended."""
         self._first_limit.cancel()
         self._cancel_line_limit()
         if error is not None and self.admitted:
@@ -252,7 +258,7 @@ class ClientConnection(asyncio.Protocol):
         self._work()
 
     def eof_received(self) -> None:
-        """Record that the client will send nothing more, and close the connection once it has all answers."""
+        """Close the connection once the client has received all answers."""
         self._half_closed = True
         self._work()
 
@@ -267,7 +273,10 @@ class ClientConnection(asyncio.Protocol):
     # -- called by the handler
 
     def send(self, message: JsonObject | bytes) -> None:
-        """Send a reply or an encoded line after all unfinished lists, or disconnect if too many lines wait."""
+        """Send a reply or an encoded line after all unfinished lists.
+
+        If too many lines wait, disconnect the client.
+        """
         if self._half_closed:  # if this is the last reply, close the connection soon
             self._schedule_work()
         line = message if isinstance(message, bytes) else encode(message)
@@ -280,12 +289,18 @@ class ClientConnection(asyncio.Protocol):
             self.stream.abort()
 
     def send_list(self, messages: Iterator[JsonObject]) -> None:
-        """Send a list of messages as fast as the client reads them. Later messages follow the list."""
+        """Send a list of messages as fast as the client reads them.
+
+        Later messages follow the list.
+        """
         self._outbox.append(messages)
         self._schedule_work()
 
     def publish(self, event: bytes, *, feedback: bool = False) -> None:
-        """Send an encoded event. If the client reads too slowly, only the newest feedback is kept."""
+        """Send an encoded event.
+
+        If the client reads too slowly, only the newest feedback is kept.
+        """
         if feedback and self.stream.congested:
             self._held_feedback = event
         else:
@@ -303,18 +318,20 @@ class ClientConnection(asyncio.Protocol):
         self.stream.close()
 
     def finish(self) -> None:
-        """Answer the lines that have arrived, send the rest of all lists, and then close the connection."""
+        """Finish all answers, and then close the connection."""
         self._finishing = True
         self._schedule_work()
 
     # -- internals
 
     def _close_after(self, seconds: float, message: str) -> asyncio.TimerHandle:
-        """Start and return a timer that closes the connection with this error message."""
+        """Start a timer that closes the connection with an error message."""
         return self._loop.call_later(seconds, self.close_with, failure(None, "too_slow", message))
 
     def _update_reading(self) -> None:
-        """Start or stop reading from the client, and the time limit for an incomplete line.
+        """Start or stop reading from the client.
+
+        Also start or cancel the time limit for an incomplete line.
 
         The server reads only while the client reads its replies and has few unprocessed lines.
         """
@@ -343,7 +360,7 @@ class ClientConnection(asyncio.Protocol):
             self.stream.abort()
 
     def _process_last_requests(self) -> None:
-        """Process the last requests of a client that closed its socket without reading the replies.
+        """Process the last requests of a client that has closed its socket.
 
         The system reports this as a connection error, but the requests can still be read after that.
         """
@@ -354,7 +371,7 @@ class ClientConnection(asyncio.Protocol):
             self._process_line(self._lines.popleft())
 
     def _work(self) -> None:
-        """Send output and process requests, up to a limit for each iteration, and close a finished connection."""
+        """Send output and process requests, up to a limit for each iteration."""
         for _ in range(LINES_PER_TURN):
             if self.stream.closing or self.stream.congested or not self._send_or_process_one():
                 break
@@ -368,7 +385,7 @@ class ClientConnection(asyncio.Protocol):
         self._update_reading()
 
     def _schedule_work(self) -> None:
-        """Schedule `_work` for the next iteration of the event loop, unless it is already scheduled."""
+        """Schedule `_work` for the next iteration of the event loop."""
         if not self._work_is_scheduled:
             self._work_is_scheduled = True
             self._loop.call_soon(self._do_scheduled_work)
@@ -379,7 +396,7 @@ class ClientConnection(asyncio.Protocol):
         self._work()
 
     def _send_or_process_one(self) -> bool:
-        """Send one line or process one request. Return False if there is nothing to do."""
+        """Send one line or process one request, if there is anything to do."""
         if self._outbox:
             first = self._outbox[0]
             if isinstance(first, bytes):
@@ -400,7 +417,10 @@ class ClientConnection(asyncio.Protocol):
         return True
 
     def _process_line(self, line: bytes) -> None:
-        """Pass a line's request to the handler, or reply with an error. An urgent request admits the client."""
+        """Pass a line's request to the handler, or reply with an error.
+
+        An urgent request admits the client.
+        """
         seq = None
         try:
             message = decode(line)

@@ -71,7 +71,9 @@ class Listener:
         return _identity(self.path) == self._identity and _is_lock_of(self.path, self._lock)
 
     def bind_again(self) -> socket.socket | None:
-        """Recreate a missing socket file or lock file. Return the old socket if the caller must close it.
+        """Recreate a missing socket file or lock file.
+
+        Return the old socket if the caller must close it.
 
         Returns:
             The old socket, which the caller must close, or None if it is still in use.
@@ -92,7 +94,10 @@ class Listener:
         return former
 
     def close(self) -> None:
-        """Close the socket and release the lock. Remove the socket file unless it was replaced."""
+        """Close the socket and release the lock.
+
+        Remove the socket file unless it was replaced.
+        """
         if _identity(self.path) == self._identity:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(self.path)
@@ -101,7 +106,10 @@ class Listener:
 
 
 class InheritedListener:
-    """A listening socket passed by systemd (LISTEN_FDS). Only systemd removes the socket file."""
+    """A listening socket passed by systemd (LISTEN_FDS).
+
+    Only systemd removes the socket file.
+    """
 
     passed = True
 
@@ -132,7 +140,9 @@ class InheritedListener:
 
 
 def listen(path: str | None, mode: int) -> Listener | InheritedListener:
-    """Return the listening socket passed by systemd if it has this path. Otherwise, bind a new socket.
+    """Return the listening socket passed by systemd if it has this path.
+
+    Otherwise, bind a new socket.
 
     Args:
         path: the path of the socket file, or None for any passed socket, or else the usual place.
@@ -156,7 +166,7 @@ def is_temporary(error: AddressInUse) -> bool:
 
 @contextlib.contextmanager
 def _raise_in_use(problem: str) -> Iterator[None]:
-    """Turn an OSError in a `with` block into AddressInUse, with `problem` as the start of the message."""
+    """Turn an OSError in a `with` block into AddressInUse."""
     try:
         yield
     except OSError as error:
@@ -164,7 +174,7 @@ def _raise_in_use(problem: str) -> Iterator[None]:
 
 
 def _identity(path: str) -> tuple[int, int] | None:
-    """Return the device and inode numbers of a file, or None if the file can't be accessed."""
+    """Return the device and inode numbers of a file, if it can be accessed."""
     try:
         status = os.lstat(path)
     except OSError:
@@ -192,12 +202,14 @@ def _path_of(passed: socket.socket) -> str:
         UsageError: if the socket is of another type, or has no path.
     """
     if passed.family != socket.AF_UNIX:
-        raise UsageError("the socket passed by systemd (LISTEN_FDS) is not a Unix socket; use ListenStream=/path")
+        raise UsageError("the socket from systemd (LISTEN_FDS) is not a Unix socket; use ListenStream=/path")
     if passed.type != socket.SOCK_STREAM or not passed.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
-        raise UsageError("the socket passed by systemd (LISTEN_FDS) doesn't listen; use ListenStream= and Accept=no")
+        raise UsageError(
+            "the socket from systemd (LISTEN_FDS) is not a listening socket; use ListenStream= and Accept=no"
+        )
     name = passed.getsockname()
     if not isinstance(name, str) or not os.path.isabs(name):
-        raise UsageError("the socket passed by systemd (LISTEN_FDS) has no path; use ListenStream=/path")
+        raise UsageError("the socket from systemd (LISTEN_FDS) has no path; use ListenStream=/path")
     return name
 
 
@@ -233,7 +245,7 @@ def _refuse_live_socket(path: str) -> None:
 
 
 def _prepare_directory(directory: str) -> None:
-    """Create the socket's directory if it doesn't exist, and check that other users can't change it.
+    """Create the socket's directory if necessary, and check that it is safe.
 
     Raises:
         AddressInUse: if the directory can't be created, or if other users could replace the socket in it.
@@ -246,7 +258,9 @@ def _prepare_directory(directory: str) -> None:
     if not stat.S_ISDIR(status.st_mode):
         raise AddressInUse(f"{directory} is not a directory; choose another path for the socket")
     if status.st_uid not in {os.getuid(), 0}:
-        raise AddressInUse(f"the socket's directory {directory} belongs to uid {status.st_uid}; choose another one")
+        raise AddressInUse(
+            f"the socket's directory {directory} belongs to uid {status.st_uid}; choose another directory"
+        )
     if status.st_mode & 0o022 and not status.st_mode & stat.S_ISVTX:
         raise AddressInUse(
             f"other users can write to the socket's directory {directory} (mode {stat.S_IMODE(status.st_mode):04o}); "
@@ -269,7 +283,10 @@ def _refuse_other_file(path: str) -> None:
 
 
 def _bind(path: str, mode: int) -> socket.socket:
-    """Remove an old socket file, and return a new socket that listens there. The caller must hold the lock."""
+    """Create a socket at the path, after removing an old socket file.
+
+    The caller must hold the lock.
+    """
     _refuse_other_file(path)
     with _raise_in_use(f"can't remove the old socket {path}"), contextlib.suppress(FileNotFoundError):
         os.unlink(path)
@@ -277,7 +294,7 @@ def _bind(path: str, mode: int) -> socket.socket:
         listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         listening.setblocking(False)
         listening.bind(path)
-        os.chmod(path, mode)  # other users can't connect before `listen`, whatever the mode was
+        os.chmod(path, mode)  # nobody can connect before `listen`
         listening.listen(MAX_BACKLOG_CONNECTIONS)
         return listening
 
@@ -286,7 +303,7 @@ def _bind(path: str, mode: int) -> socket.socket:
 
 
 def _acquire_lock(path: str) -> int:
-    """Lock a socket's path for this server, write the process id, and return the lock file's descriptor.
+    """Lock a socket's path, and return the lock file's descriptor.
 
     The lock lasts until the descriptor is closed.
 
@@ -304,19 +321,22 @@ def _acquire_lock(path: str) -> int:
             break
         os.close(fd)  # the file was removed before it was locked, so try again
     os.ftruncate(fd, 0)
-    with contextlib.suppress(OSError):  # the disk may be full, but nothing depends on this number
+    with contextlib.suppress(OSError):  # the disk may be full, but nothing depends on the process id
         os.write(fd, f"{os.getpid()}\n".encode())
     return fd
 
 
 def _is_lock_of(path: str, fd: int) -> bool:
-    """Return whether the lock file of a path is the file with this descriptor."""
+    """Return whether a descriptor refers to the lock file of a path."""
     status = os.fstat(fd)
     return _identity(f"{path}.lock") == (status.st_dev, status.st_ino)
 
 
 def _open_lock(path: str) -> int:
-    """Open or create a lock file, and return its descriptor. Raises AddressInUse if it isn't a plain file."""
+    """Open or create a lock file, and return its descriptor.
+
+    Raises AddressInUse if it isn't a plain file.
+    """
     flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     while True:
         with _raise_in_use(f"can't open the lock file {path}"):
@@ -354,7 +374,7 @@ def _process_exists(pid: int) -> bool:
 
 
 def _read_holder(fd: int) -> int | None:
-    """Wait for the process id in the lock file, and return it, or None if it isn't written in time.
+    """Wait for the process id in the lock file, and return it.
 
     The id of a process that no longer exists was written by an earlier server, and is ignored.
     """

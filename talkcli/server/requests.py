@@ -72,7 +72,7 @@ class Requests:
         speech.on_queue_change = self._schedule_room_check
 
     def handle(self, connection: ClientConnection, seq: int | None, request: Request) -> None:
-        """Start to carry out a client's request. The reply may be sent later."""
+        """Start to carry out a client's request."""
         pending = PendingRequest(connection, seq, request)
         connection.unanswered[pending] = None
         pending.start(self._carry_out(pending))
@@ -95,14 +95,14 @@ class Requests:
             self._speech.apply(self._scheduler.producer_left(record, self._speech.advance_time()))
 
     def shut_down(self) -> None:
-        """End all goals, including those that wait for room in the queue, and reject new ones."""
+        """End all goals, including waiting ones, and reject new ones."""
         notifications = self._cancel_waiting(self._select_waiting(Cancel()), None)
         self._speech.shut_down()
         resume_all(self._speech.waiting_for_voices)
         self._speech.notifications.add(notifications)
 
     async def _carry_out(self, pending: PendingRequest) -> None:
-        """Wait for the list of voices if necessary, carry out a request, and reply with an error if it fails."""
+        """Carry out a request, and reply with an error if it fails."""
         request = pending.request
         try:
             if isinstance(request, Cancel | Pause):
@@ -130,7 +130,7 @@ class Requests:
         return [each for each in connection.unanswered if each.waiting_list is self._speech.waiting_for_voices]
 
     def _must_await_voices(self, pending: PendingRequest) -> bool:
-        """Return whether a request must wait for the list of voices, because it or an earlier request needs it."""
+        """Return whether a request must wait for the list of voices."""
         request = pending.request
         if self._speech.waiting_for_voices and (isinstance(request, Say) or self._awaiting_voices(pending.connection)):
             return True
@@ -138,12 +138,15 @@ class Requests:
         return self._speech.awaits_voices and (names_voice or isinstance(request, Voices))
 
     def _stop_awaiting_voices(self, connection: ClientConnection) -> None:
-        """Continue the requests of a connection without waiting any longer for the list of voices."""
+        """Continue the requests of a connection that wait for the list of voices."""
         for each in self._awaiting_voices(connection):
             each.resume()
 
     def _reserve_memory(self, pending: PendingRequest) -> bool:
-        """Count a waiting request's memory and return True. If too many wait, set its refusal and return False."""
+        """Reserve memory for a waiting request.
+
+        If too many wait, set its refusal and return False.
+        """
         if pending.kept_bytes:
             return True  # the request has waited before
         size = REQUEST_BYTES + sum(map(_memory_of, fields(pending.request).values()))
@@ -159,19 +162,19 @@ class Requests:
         return False
 
     def _schedule_room_check(self) -> None:
-        """Schedule a check of the goals that wait for room, unless there are none or it is already scheduled."""
+        """Schedule a check of the goals that wait for room, if there are any."""
         if self._speech.waiting_for_room and self._room_check is None:
             # Check in the next iteration of the event loop, because the caller may not have finished its changes.
             self._room_check = asyncio.get_running_loop().call_soon(self._submit_waiting_goals)
 
     def _submit_waiting_goals(self) -> None:
-        """Continue the waiting `say` requests for whose goals the queue now has room."""
+        """Continue waiting `say` requests if the queue now has room."""
         self._room_check = None
         without_room: set[object] = set()
         for each in list(self._speech.waiting_for_room):
             say = each.request
             assert isinstance(say, Say)
-            # For a goal without an id, the result depends only on these values, so equal goals are checked once.
+            # If there is no room for a goal without an id, there is none for others with the same values.
             kind = (say.priority, say.key, say.flush, say.preempt) if say.id is None else None
             if kind in without_room:
                 continue
@@ -183,7 +186,7 @@ class Requests:
                 each.resume()
 
     def _select_waiting(self, selection: Cancel) -> list[PendingRequest]:
-        """Return the `say` requests that a cancel selects while they wait for room or for the list of voices."""
+        """Return the waiting `say` requests that a cancel selects."""
         waiting = (*self._speech.canceled_goals, *self._speech.waiting_for_room, *self._speech.waiting_for_voices)
         goals = [(each, each.request) for each in waiting if isinstance(each.request, Say)]
         selected = (goals[index][0] for index in selection.select_waiting([say for _, say in goals]))
@@ -191,9 +194,9 @@ class Requests:
         return [each for each in selected if not each.connection.detect_hang_up()]
 
     def _cancel_waiting(self, goals: list[PendingRequest], by: By | None) -> list[Callable[[], None]]:
-        """Mark waiting goals as cancelled, and return functions that submit them to the scheduler.
+        """Mark waiting goals as cancelled.
 
-        The scheduler then recalls them like other goals.
+        Return functions that submit them to the scheduler. The scheduler then recalls them like other goals.
         """
         new = [each for each in goals if each.waiting_list is not self._speech.canceled_goals]
         for each in new:
@@ -202,7 +205,10 @@ class Requests:
         return [each.resume for each in new]
 
     async def _await_room(self, pending: PendingRequest, say: Say) -> float:
-        """Wait until the queue has room or the goal has expired. Return the waiting time in seconds."""
+        """Wait until the queue has room or the goal has expired.
+
+        Return the waiting time in seconds.
+        """
         ttl = (self._scheduler.settings.ttl if say.ttl is None else say.ttl) or None
         began = self._speech.advance_time().monotonic
         self._speech.subscribers.schedule_keep_alive()
@@ -213,7 +219,10 @@ class Requests:
     # -- coroutines, named after the requests that they handle
 
     async def _say(self, pending: PendingRequest, say: Say) -> None:
-        """Submit a goal, after waiting for room if it is a `patient` goal and the queue is full, and reply."""
+        """Submit a goal and reply.
+
+        If the queue is full, a `patient` goal first waits for room.
+        """
         speech, scheduler, connection = self._speech, self._scheduler, pending.connection
         waited = 0.0
         if pending.canceled_by is None:
@@ -287,7 +296,9 @@ class Requests:
         return producer is None or producer.detect_hang_up()
 
     def _check_goal(self, pending: PendingRequest, say: Say) -> tuple[Say, Refusal | None]:
-        """Return the goal with the id of its voice, and the server's reason to refuse the goal, or None.
+        """Fill in the id of a goal's voice.
+
+        Return the new goal, and the reason to refuse it, if any.
 
         Refusals that need a clock, files or other I/O belong here. The scheduler decides about all others.
         """
@@ -299,7 +310,7 @@ class Requests:
         return say, pending.refusal or refusal
 
     async def _wait(self, pending: PendingRequest, request: Wait) -> None:
-        """Reply with the requested goals, and subscribe the client to those that haven't ended."""
+        """Reply with goals, and subscribe the client to those that haven't ended."""
         await self._speech.notifications.wait_done(pending)  # send earlier events of a goal before its result
         if request.ids is None:
             records = self._scheduler.unfinished()
@@ -318,7 +329,7 @@ class Requests:
         pending.answer(({"goal": each.to_json()} for each in goals), results, count=len(records))
 
     async def _cancel(self, pending: PendingRequest, selection: Cancel) -> None:
-        """Cancel goals, wait until the active one is silent, and reply with the cancelled and the ended goals."""
+        """Cancel goals, and reply when the active one is silent."""
         speech, client = self._speech, pending.connection.client
         now = speech.advance_time()
         waiting = self._select_waiting(selection)
@@ -342,7 +353,10 @@ class Requests:
             pending.answer(goals, count=len(ended))
 
     async def _pause(self, pending: PendingRequest, _: Pause) -> None:
-        """Pause speech, and reply when the active goal is silent. Raises RequestRefused if that takes too long."""
+        """Pause speech, and reply when the active goal is silent.
+
+        Raises RequestRefused if that takes too long.
+        """
         speech, scheduler = self._speech, self._scheduler
         speech.advance_time()
         changed, effects, active = not scheduler.paused, scheduler.pause(), scheduler.active
@@ -374,7 +388,10 @@ class Requests:
         self._answer_pause(pending, active)
 
     def _publish_pause(self, affected: Record | None, pending: PendingRequest) -> None:
-        """Publish and log that speech was paused or resumed. `affected` is the goal being spoken, if any."""
+        """Publish and log that speech was paused or resumed.
+
+        `affected` is the goal being spoken, if any.
+        """
         paused, client = self._scheduler.paused, pending.connection.client
         goal_id = affected.id if affected else None
         publish = self._speech.subscribers.paused_changed
@@ -382,7 +399,10 @@ class Requests:
         log.write(f"{'paused' if paused else 'resumed'} by {describe_sender(client)}")
 
     def _answer_pause(self, pending: PendingRequest, goal: Record | None) -> None:
-        """Reply to a `pause` or `resume` request, with the goal unless it has ended."""
+        """Reply to a `pause` or `resume` request.
+
+        The reply contains the goal unless it has ended.
+        """
         shown = None if goal is None or goal.state.terminal else goal.snapshot().to_json()
         pending.answer(paused=self._scheduler.paused, goal=shown)
 
@@ -394,7 +414,7 @@ class Requests:
             pending.answer(goal=self._require_goal(request.id).snapshot().to_json())
 
     async def _watch(self, pending: PendingRequest, _: Watch) -> None:
-        """Reply with the state of the server and its goals, and subscribe the client to all events."""
+        """Reply with the state of the server, and subscribe the client to all events."""
         await self._speech.notifications.wait_done(pending)  # send earlier events before the overview
         self._answer_overview(pending)
         self._speech.subscribers.watch(pending.connection)
@@ -442,7 +462,7 @@ class Requests:
         pending.answer(settings=options.shown_settings(scheduler.settings))
 
     def _require_goal(self, goal_id: str) -> Record:
-        """Return the goal with this id. Raises UnknownGoal if there is none."""
+        """Return the goal with this id, or raise UnknownGoal."""
         record = self._scheduler.find(goal_id)
         if record is None:
             raise UnknownGoal(_unknown_message(goal_id))
@@ -455,11 +475,14 @@ def _unknown_message(*ids: str) -> str:
 
 
 def _goal_items(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:
-    """Yield a list item for each goal, with a copy of the goal in the field `name`, made when it is sent."""
+    """Yield a list item for each goal.
+
+    The goal is copied when the item is sent.
+    """
     return ({name: each.snapshot().to_json()} for each in records)
 
 
 def _memory_of(value: object) -> int:
-    """Estimate the memory used by a value in bytes, which may be many times the size of its JSON."""
+    """Estimate how many bytes of memory a value uses."""
     inside = value.values() if isinstance(value, dict) else value if isinstance(value, (list, tuple)) else ()
     return sys.getsizeof(value) + sum(map(_memory_of, inside))

@@ -73,7 +73,7 @@ class ServerSettings:
 
 
 def serve(settings: ServerSettings) -> int:
-    """Run a server until it receives SIGTERM or SIGINT, and return the exit code.
+    """Run a server until it receives SIGTERM or SIGINT.
 
     Raises:
         AddressInUse: if another server is running, or the socket's directory isn't safe.
@@ -92,7 +92,10 @@ def serve(settings: ServerSettings) -> int:
 
 
 class Server:
-    """A server that handles the connections of its clients. Create it inside a running event loop."""
+    """A server that handles the connections of its clients.
+
+    Create it inside a running event loop.
+    """
 
     def __init__(self, settings: ServerSettings, listener: Listener | InheritedListener) -> None:
         self._settings = settings
@@ -128,7 +131,7 @@ class Server:
         self._end_signals = [signal.SIGTERM] if ignored else [signal.SIGTERM, signal.SIGINT]
 
     async def run(self) -> None:
-        """Run the server until it is stopped by a signal or fails, and then close all connections."""
+        """Run the server until a signal or an error stops it."""
         settings, speech = self._settings, self.speech
         descriptors = raise_descriptor_limit(settings.max_clients + MAX_EXTRA_CLIENTS)
         self._acceptor = Acceptor(lambda each: ClientConnection(self, speech.streams, each).begin(), descriptors)
@@ -180,9 +183,11 @@ class Server:
             raise self._fatal_error
 
     def _prepare_voice(self) -> str | None:
-        """Return the configured voice if the engine must check it. Check and set a neural voice, and return None.
+        """Return the configured voice if the engine must check it.
 
-        A neural voice is checked here. It becomes a setting and is loaded later, so that it doesn't delay speech.
+        A neural voice is checked here.
+
+        A neural voice becomes a setting and is loaded later, so that it doesn't delay speech.
 
         Raises:
             UsageError: if a neural voice is unknown.
@@ -197,7 +202,10 @@ class Server:
         return None
 
     def _maintain_socket(self) -> None:
-        """Bind the socket again if clients can't find it, or shut down if that fails. Schedule the next check."""
+        """Bind the socket again if clients can't find it, or shut down if that fails.
+
+        Schedule the next check.
+        """
         self._socket_check = self._loop.call_later(SOCKET_CHECK_S, self._maintain_socket)
         if self._listener.in_place():
             self._unreachable = ""
@@ -222,11 +230,11 @@ class Server:
     # -- called by connections
 
     def joined(self, connection: ClientConnection) -> None:
-        """Identify a new client, and then admit it, keep it waiting, or refuse it."""
+        """Admit a new client, keep it waiting, or refuse it."""
         pid, uid = peers.credentials(connection.stream.socket)
         # Other users may connect only if the socket's mode allows it.
         if uid not in {os.getuid(), 0} and not self._listener.mode & 0o066:
-            words = f"this server belongs to uid {os.getuid()}, who can let you in with: talk serve --socket-mode 0660"
+            words = f"this server belongs to uid {os.getuid()}; ask its owner to run: talk serve --socket-mode 0660"
             connection.close_with({"talk": PROTOCOL, "error": "permission_denied", "message": words})
         elif len(self.connections) >= self._settings.max_clients + MAX_EXTRA_CLIENTS:
             connection.close_with(busy_greeting())
@@ -238,7 +246,10 @@ class Server:
             self._no_clients.clear()
 
     def left(self, connection: ClientConnection) -> None:
-        """Remove a client, and admit the next waiting one. The goals of the removed client continue."""
+        """Remove a client, and admit the next waiting one.
+
+        The goals of the removed client continue.
+        """
         self.connections.discard(connection)
         if not self.connections:
             self._no_clients.set()
@@ -298,7 +309,7 @@ class Server:
             connection.stream.abort()
 
     def _on_signal(self, number: signal.Signals) -> None:
-        """Log the signal and start to shut down. A second signal ends the process immediately."""
+        """Log the signal, and start to shut down."""
         log.write(f"stopping after {signal.Signals(number).name}")
         for each in self._end_signals:
             # A second signal ends the server immediately, without the event loop, which may be busy.
@@ -306,7 +317,10 @@ class Server:
         self._end()
 
     def _on_second_signal(self, number: int, _: object) -> None:
-        """Close the socket and exit immediately. The engine process notices this and exits, too."""
+        """Close the socket and exit immediately.
+
+        The engine process notices this and exits, too.
+        """
         with contextlib.suppress(OSError):
             self._listener.close()
         os._exit(EXIT_SIGNAL + number)

@@ -69,7 +69,7 @@ def unheard_chars(record: Record) -> int:
 
 
 def elapsed() -> float:
-    """Return a monotonic time in seconds, which includes the time that the machine was suspended."""
+    """Return a monotonic time that doesn't stop while the machine is suspended."""
     return time.clock_gettime(_CLOCK)
 
 
@@ -122,13 +122,13 @@ class Speech:
         self.silent_goal: Record | None = None
         #: unprocessed reports from the engine thread
         self._reports: deque[Report] = deque()
-        #: whether the event loop has been woken to process reports, which is too slow to do for each report
+        #: whether the event loop has been woken to process reports. Waking it for each report would be too slow.
         self._reports_due = False
-        #: what the engine was last told: whether another goal follows, and whether its voice is neural
+        #: what the engine was last told about the next goal: whether there is one, and whether its voice is neural
         self._announced_next = False, False
 
     def status_words(self) -> str:
-        """Return a short status message without the texts of goals, because every user can read it."""
+        """Return a short status message that every user may read."""
         scheduler, ready = self.scheduler, self.ready
         if self.engine_status != READY:
             doing = f"engine: {self.engine_status}"
@@ -146,7 +146,7 @@ class Speech:
         return self.voices.listed is None and self.engine_status in {"starting", READY}
 
     def waiting_for_silence(self, record: Record) -> WaitingList:
-        """Return the requests that wait for this goal to become silent, to continue or to end."""
+        """Return the requests that wait for a goal to become silent or to end."""
         return self._waiting_for_silence.setdefault(record, {})
 
     def waiting_for_hearing(self, record: Record) -> WaitingList:
@@ -174,7 +174,7 @@ class Speech:
         return now
 
     def apply(self, effects: list[Effect]) -> None:
-        """Carry out the scheduler's effects: first the orders to the engine, then the notifications of clients."""
+        """Carry out the scheduler's effects, starting with orders to the engine."""
         changes, queue_changed, at = [], False, time.time()
         for effect in effects:
             if isinstance(effect, StateChange):
@@ -225,7 +225,7 @@ class Speech:
                 self.engine.resume(record.id)
 
     def _start_speaking(self, record: Record) -> None:
-        """Tell the engine to speak a goal, or report it as failed if a voice that it requires is unavailable."""
+        """Tell the engine to speak a goal, or fail it if its voice is unavailable."""
         self._announced_next = next_waits, next_is_neural = self._describe_next()
         options = engine_options(record.say, self.scheduler.settings)
         if not is_neural(options["voice"] or ""):
@@ -246,7 +246,7 @@ class Speech:
         self.engine.speak(command)
 
     def _announce_next(self) -> None:
-        """Tell the engine whether another goal follows the active one, so that it can prepare for it."""
+        """Tell the engine whether another goal follows the active one."""
         active, following = self.scheduler.active, self._describe_next()
         if active and following != self._announced_next:
             self._announced_next = following
@@ -258,7 +258,10 @@ class Speech:
         return following is not None, following is not None and is_neural(self.scheduler.wanted_voice(following))
 
     def _publish_change(self, record: Record, state: State, at: float) -> None:
-        """Send a goal's new state to clients. If it has ended, log it and resume the requests waiting for it."""
+        """Send a goal's new state to clients.
+
+        If it has ended, log it and resume the requests waiting for it.
+        """
         self.subscribers.state_changed(record, state, at)
         if state.terminal:
             _log_goal_end(record, elapsed() - record.began_at)
@@ -266,7 +269,7 @@ class Speech:
             resume_all(self._waiting_for_hearing.pop(record, {}))
 
     def _set_timer(self) -> None:
-        """Schedule `_tick` for the scheduler's next time limit, and cancel the previous timer."""
+        """Set the timer for the scheduler's next time limit."""
         if self._timer:
             self._timer.cancel()
         deadline = self.scheduler.deadline()
@@ -320,7 +323,7 @@ class Speech:
             self._process_engine_event(report, now)
 
     def _process_goal_event(self, event: protocol.GoalEvent, active: Record, now: Now) -> None:
-        """Process the engine's report of a word, the output, the voice, a pause or the end of the active goal."""
+        """Process the engine's report about the active goal."""
         scheduler = self.scheduler
         match event:
             case protocol.TextMissing():
@@ -340,7 +343,11 @@ class Speech:
                 scheduler.output_changed(event.id, Output.from_json(event.output))
             case protocol.VoiceChosen():
                 if event.fallback_reason:
-                    log.write(log.sanitize(f"{event.id} is spoken by {event.voice} instead: {event.fallback_reason}"))
+                    log.write(
+                        log.sanitize(
+                            f"{event.id} is spoken with the voice {event.voice} instead: {event.fallback_reason}"
+                        )
+                    )
                 self.apply(scheduler.voice_chosen(event.id, event.voice, now))
             case protocol.Held():
                 if active.paused and active.pause_count == event.number:
@@ -348,7 +355,7 @@ class Speech:
                     resume_all(self.waiting_for_silence(active))
 
     def _process_voice_event(self, event: protocol.VoiceEvent, now: Now) -> None:
-        """Process the engine's list of voices, or its report of a loaded, measured or unloaded voice."""
+        """Process the engine's report about a voice or its list of voices."""
         scheduler = self.scheduler
         match event:
             case protocol.VoiceList():
@@ -364,7 +371,7 @@ class Speech:
                 self.apply(scheduler.voice_unloaded(event.voice, now))
 
     def _process_engine_event(self, event: Report, now: Now) -> None:
-        """Process a report about the engine itself, for example that it is ready or has died."""
+        """Process a report about the engine itself."""
         match event:
             case protocol.Ready():
                 self._handle_ready(event, now)
@@ -385,7 +392,7 @@ class Speech:
                     self.apply(self.scheduler.failed(active.id, Reason.ENGINE_FAILED, event.message, None, now))
 
     def _end_active_goal(self, ended: protocol.Ended, active: Record, now: Now) -> None:
-        """End the active goal as the engine reports: completed, stopped or failed."""
+        """End the active goal after the engine's report."""
         scheduler = self.scheduler
         if self.ready and ended.player:  # let `status` show the player that was used
             self.ready = replace(self.ready, player=ended.player)
@@ -421,7 +428,7 @@ class Speech:
             self.apply(self.scheduler.engine_unavailable(now))
 
     def _record_engine_failure(self, message: str) -> None:
-        """Record and log why there is no engine, and resume the requests that wait for its list of voices."""
+        """Record and log the reason why there is no engine."""
         if message != self.engine_status:
             log.write(log.sanitize(message))
         self.engine_status = message
@@ -436,7 +443,7 @@ class Speech:
         self.apply(self.scheduler.shutdown(self.advance_time()))
 
     def _finish_if_all_ended(self) -> None:
-        """Set `finished` if the server is shutting down, all goals have ended, and clients have been notified."""
+        """Set `finished` once all goals have ended during a shutdown."""
         if self.scheduler.closing and not (self.scheduler.active or self.canceled_goals):
             self.finished.set()
 
@@ -445,7 +452,7 @@ class Speech:
 
 
 def _log_goal_end(record: Record, seconds: float) -> None:
-    """Log that a goal has ended. `seconds` is how long it was active."""
+    """Log the end of a goal that was active for `seconds`."""
     took = "" if record.started_at is None else f" after {seconds:.1f} s"
     how = f"{record.id} {record.state.name}{took}"
     if record.state is not State.SUCCEEDED:
@@ -476,7 +483,7 @@ def _log_voice_load(voice: protocol.VoiceLoaded) -> None:
     """Log that a neural voice was loaded, or that loading it failed."""
     how = f"loaded in {voice.seconds:.1f} s"
     if voice.error is not None:
-        how = f"can't be loaded, so espeak speaks (except with --voice-only): {log.sanitize(voice.error)}"
+        how = f"can't be loaded, so espeak is used instead (except with --voice-only): {log.sanitize(voice.error)}"
     log.write(f"voice {log.sanitize(voice.voice)} {how}")
 
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 #: Maximum number of bytes to read at once, equal to the maximum length of a request.
 _READ_BYTES = 64 * 1024
-#: When this much output has collected, it is sent without waiting for the end of the iteration.
+#: Output of this size is sent without waiting for the end of the iteration.
 _FLUSH_BYTES = 64 * 1024
 #: If a client has more unread output than this, the server drops its feedback and stops reading its requests.
 CONGESTION_BYTES = 256 * 1024
@@ -52,11 +52,10 @@ _NO_CONNECTION = {errno.EAGAIN, errno.ECONNABORTED, errno.EPROTO, errno.EINTR}
 
 
 class ClientStreams:
-    """The streams of all clients, which send their output together and share a limit for unread output.
+    """The streams of all clients, which share a limit for unread output.
 
-    It sends their output at the end of each iteration of the event loop, and limits the unread output of all clients
-    together. All streams share one callback per iteration. This saves a third of the time if fifty clients watch the
-    words.
+    The output is sent at the end of each iteration of the event loop, in one callback for all streams. This saves a
+    third of the time if fifty clients watch the words.
     """
 
     def __init__(self) -> None:
@@ -68,7 +67,7 @@ class ClientStreams:
         self._written: dict[ClientStream, None] = {}
 
     def shed_load(self) -> None:
-        """Disconnect the clients with the most unread output until the total is within the limit."""
+        """Disconnect the clients with the most unread output."""
         while self.unread_bytes > MAX_TOTAL_OUTPUT_BYTES and self.open:
             max(self.open, key=lambda each: each.unsent_bytes + each.held_bytes).abort()
             total = MAX_TOTAL_OUTPUT_BYTES >> 20
@@ -81,7 +80,7 @@ class ClientStreams:
         self._written[stream] = None
 
     def _flush_written(self) -> None:
-        """Send the output of all streams that were written to in this iteration."""
+        """Send the output that was written in this iteration."""
         written, self._written = self._written, {}
         for stream in written:
             try:
@@ -124,7 +123,10 @@ class ClientStream:
     # -- input
 
     def begin(self) -> None:
-        """Send pending output and start reading. Data that has already arrived is read at once."""
+        """Send pending output and start reading.
+
+        Data that has already arrived is read at once.
+        """
         self.flush()
         self.resume_reading()
         if self._reading:
@@ -170,14 +172,17 @@ class ClientStream:
         return len(self._unread)
 
     def count_held(self, size_bytes: int) -> None:
-        """Add to the size of the output that the receiver holds back (may be negative), and enforce the limits."""
+        """Adjust the size of the output that the receiver holds back."""
         if self in self._streams.open:
             self.held_bytes += size_bytes
             self._streams.unread_bytes += size_bytes
             self._streams.shed_load()
 
     def write(self, data: bytes) -> None:
-        """Queue data to be sent soon. If too much output is unread in total, disconnect the slowest clients."""
+        """Queue data to be sent soon.
+
+        If too much output is unread in total, disconnect the slowest clients.
+        """
         if self.closing:
             return
         self._unread += data
@@ -191,7 +196,7 @@ class ClientStream:
         self._streams.shed_load()
 
     def flush(self) -> None:
-        """Send the output now. If the client has closed its socket, this sets `closing`."""
+        """Send the output now, and set `closing` if the client has closed its socket."""
         if self._unread and not self._blocked:
             self._send()
 
@@ -205,7 +210,10 @@ class ClientStream:
             self.abort()
 
     def _send(self) -> None:
-        """Send as much output as the socket accepts now. If the stream is closing, close it after the last byte."""
+        """Send as much output as the socket accepts now.
+
+        If the stream is closing, close it after the last byte.
+        """
         try:
             sent = self.socket.send(self._unread)
         except BlockingIOError:
@@ -227,7 +235,7 @@ class ClientStream:
             self._report_congestion()
 
     def _report_congestion(self) -> None:
-        """Tell the receiver to pause or resume writing, depending on the size of the unsent output."""
+        """Tell the receiver to pause or resume writing, if necessary."""
         if not self.congested and len(self._unread) > CONGESTION_BYTES:
             self.congested = True
             self._receiver.pause_writing()
@@ -263,7 +271,10 @@ class ClientStream:
 
 
 def raise_descriptor_limit(clients: int) -> int:
-    """Raise the limit of open files to fit this number of clients, or log that it is too low. Return the limit."""
+    """Raise the limit of open files to fit this number of clients.
+
+    Return the limit.
+    """
     wanted = clients + RESERVED_DESCRIPTORS + OWN_DESCRIPTORS
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     allowed, most = (2**31 if each == resource.RLIM_INFINITY else each for each in limits)
@@ -274,14 +285,17 @@ def raise_descriptor_limit(clients: int) -> int:
     if allowed < wanted:
         fitting = max(0, allowed - RESERVED_DESCRIPTORS - OWN_DESCRIPTORS)
         log.write(
-            f"only {allowed} files may be open, enough for {fitting} clients instead of {clients}; "
+            f"the limit of {allowed} open files only allows {fitting} clients instead of {clients}; "
             f"raise LimitNOFILE= or ulimit -n to {wanted}"
         )
     return allowed
 
 
 class Acceptor:
-    """Accepts connections on a listening socket. Some descriptors stay reserved for the engine."""
+    """Accepts connections on a listening socket.
+
+    Some descriptors stay reserved for the engine.
+    """
 
     def __init__(self, serve: Callable[[socket.socket], None], max_descriptors: int) -> None:
         """Create the acceptor. Call `open` to start.
@@ -312,7 +326,10 @@ class Acceptor:
             self._listening = None
 
     def _accept(self, listening: socket.socket) -> None:
-        """Accept some of the waiting connections, and pass them to `serve`. Pause for a second after an error."""
+        """Accept some of the waiting connections, and pass them to `serve`.
+
+        Pause for a second after an error.
+        """
         for _ in range(ACCEPTS_PER_TURN):
             try:
                 connected, _ = listening.accept()
@@ -336,8 +353,8 @@ class Acceptor:
                 connected.close()
 
     def _turn_away(self, connected: socket.socket) -> None:
-        """Tell a client that the server has too few file descriptors, and close the connection."""
-        limit = f"only {self._max_descriptors} files may be open; raise LimitNOFILE= or ulimit -n"
+        """Refuse a connection because the server has too few file descriptors."""
+        limit = f"the limit of {self._max_descriptors} open files was reached; raise LimitNOFILE= or ulimit -n"
         log.write_limited("descriptors", f"refused a client: {limit}")
         with connected, contextlib.suppress(OSError):  # the client may have closed the connection
             connected.send(encode(busy_greeting(_TOO_FEW_DESCRIPTORS)))

@@ -1,4 +1,4 @@
-"""Sends events and keep-alive messages to clients that wait for a goal or watch all goals.
+"""Sends events and keep-alive messages to subscribed clients.
 
 A cancel may end thousands of goals. Therefore, events are sent no faster than clients read them.
 """
@@ -61,7 +61,7 @@ class Subscribers:
         self._alive_timer: asyncio.TimerHandle | None = None
 
     def subscribe_to_goal(self, goal_id: str, connection: ClientConnection, *, feedback: bool = False) -> None:
-        """Subscribe a connection to a goal's states and result, and with `feedback` also to its words."""
+        """Subscribe a connection to a goal's states and result, and optionally its words."""
         waiting = self._waiters.setdefault(goal_id, {})
         waiting[connection] = waiting.get(connection, False) or feedback
         self.schedule_keep_alive()
@@ -82,7 +82,10 @@ class Subscribers:
             waiting.pop(connection, None)
 
     def state_changed(self, record: Record, state: State, at: float) -> None:
-        """Publish a goal's new state, and its result if it has ended. Waiting clients are then unsubscribed."""
+        """Publish a goal's new state, and its result if it has ended.
+
+        Waiting clients are then unsubscribed.
+        """
         event = StateChanged(record.id, state, at, next(self._numbers))
         if self._watchers:
             # The first and the last event of a goal contain the whole goal.
@@ -97,7 +100,7 @@ class Subscribers:
                 connection.publish(lines)
 
     def word_heard(self, word: Word, text: str, at: float) -> None:
-        """Publish that a word is being spoken to the connections that want feedback.
+        """Send a word that is being spoken to the connections that want feedback.
 
         Args:
             word: the engine's event.
@@ -118,7 +121,10 @@ class Subscribers:
         _publish(event.to_json(), self._feedback_receivers([self._waiters.get(goal_id, {})]))
 
     def paused_changed(self, goal_id: str | None, *, paused: bool, by: By, at: float) -> None:
-        """Publish that speech was paused or resumed. `goal_id` is the id of the affected goal, if any."""
+        """Publish that speech was paused or resumed.
+
+        `goal_id` is the id of the affected goal, if any.
+        """
         event = PausedChanged(paused, goal_id, by, at, next(self._numbers))
         _publish(event.to_json(), self._feedback_receivers(self._waiters.values()))
 
@@ -128,14 +134,14 @@ class Subscribers:
             self._alive_timer = self._loop.call_later(CLIENT_ALIVE_INTERVAL_S, self._send_alive)
 
     def _feedback_receivers(self, waiters: Iterable[dict[ClientConnection, bool]]) -> dict[ClientConnection, None]:
-        """Return all connections that watch, and those of the waiting connections that want feedback."""
+        """Return all connections that watch, and the waiting ones that want feedback."""
         listeners = dict(self._watchers)
         for each in waiters:
             listeners.update((connection, None) for connection, feedback in each.items() if feedback)
         return listeners
 
     def _send_alive(self) -> None:
-        """Send a keep-alive message to all clients that are waiting or watching, and schedule the next one."""
+        """Send a keep-alive message to all subscribed clients."""
         self._alive_timer = None
         listeners = dict.fromkeys(chain(self._watchers, self._waiting_for_room(), *self._waiters.values()))
         _publish({"event": "alive"}, listeners)
@@ -144,7 +150,10 @@ class Subscribers:
 
 
 def _publish(event: JsonObject, connections: Iterable[ClientConnection], *, feedback: bool = False) -> None:
-    """Encode an event once, and send it to these connections. Feedback may be dropped for slow clients."""
+    """Encode an event once, and send it to several connections.
+
+    Feedback may be dropped for slow clients.
+    """
     receivers = list(connections)
     line = encode(event) if receivers else b""  # usually, there are no receivers
     for connection in receivers:
@@ -174,7 +183,10 @@ class Notifications:
         return not self._pending
 
     def add(self, notifications: Iterable[Callable[[], None]]) -> None:
-        """Add functions to the queue, and begin to call them. Functions added by another one are called at once."""
+        """Queue functions, and start calling them.
+
+        If a called function adds more, those are called at once.
+        """
         if self._working:
             for each in notifications:
                 self._call(each)
@@ -190,7 +202,7 @@ class Notifications:
             await request.wait({})
 
     def _work(self, unread_before: int) -> None:
-        """Call functions from the queue, up to a limit for each iteration, and schedule a call for the rest.
+        """Call functions from the queue, up to a limit for each iteration.
 
         Args:
             unread_before: the size of the unread output before the first call.
@@ -212,7 +224,10 @@ class Notifications:
             self._turn = self._loop.call_soon(self._work, min(unread_before, self._streams.unread_bytes))
 
     def _await_readers(self, unread_before: int, until: float) -> None:
-        """Continue when the clients have read the new output, or at the time `until` at the latest."""
+        """Continue once clients have read the new output, or at the time `until`.
+
+        Otherwise, check again soon.
+        """
         if self._streams.unread_bytes <= unread_before:
             self._work(unread_before)
         elif self._loop.time() < until:

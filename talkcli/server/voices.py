@@ -1,4 +1,6 @@
-"""Finds the voice that a client asks for. `goals.voices` decides when voices are loaded.
+"""Finds the voice that a client asks for.
+
+`goals.voices` decides when voices are loaded.
 
 The directories of neural voices are read only if a client asks for a voice that the engine has not listed.
 """
@@ -27,10 +29,11 @@ class VoiceCatalog:
         self.driver: str | None = None
 
     def look_up(self, voice: str | None, settings_voice: str | None = None) -> tuple[str | None, Refusal | None]:
-        """Return the voice that a client asks for, and a refusal if the voice is not available.
+        """Return the voice that a client asks for.
 
-        For a neural voice, the first value is the id. For every other voice, it is the client's input. The default
-        voice is never checked, and other voices are not checked before the engine has listed its voices.
+        If it is not available, also return a refusal. For a neural voice, the first value is the id. For every other
+        voice, it is the client's input. The default voice is never checked, and other voices are not checked before the
+        engine has listed its voices.
 
         Args:
             voice: the client's input.
@@ -62,7 +65,10 @@ class VoiceCatalog:
             return 0
 
     def _find(self, voice: str, settings_voice: str | None) -> Voice | None:
-        """Return the voice that matches the client's input, or None. Read directories only if necessary."""
+        """Return the voice that matches the client's input, if any.
+
+        Read directories only if necessary.
+        """
         if not (is_neural(voice) or is_neural(settings_voice or "")):
             found = find_voice(voice, self._driver_voices)
             if found is not None:
@@ -71,11 +77,11 @@ class VoiceCatalog:
 
     @property
     def _driver_voices(self) -> tuple[Voice, ...]:
-        """Voices listed by the engine that are not neural."""
+        """The voices that the engine has listed, without neural ones."""
         return tuple(each for each in self.listed or () if not is_neural(each.id))
 
     def _candidates(self, voice: str) -> tuple[Voice, ...]:
-        """Return the voices to search for this name, including the neural voices that are installed now."""
+        """Return the voices to search for a name."""
         own = () if is_neural(voice) else self._driver_voices
         if self._foreign_driver is not None:
             return own
@@ -84,7 +90,7 @@ class VoiceCatalog:
 
     @property
     def _foreign_driver(self) -> str | None:
-        """Name of the driver if it is not `talk`'s own, or None.
+        """The name of the driver, unless it is `talk`'s own.
 
         Other drivers have no neural voices.
         """
@@ -92,7 +98,7 @@ class VoiceCatalog:
 
     @staticmethod
     def _missing_part(voice: str) -> str | None:
-        """Return an error message if a neural voice lacks the named speaker or a Python package, or None."""
+        """Return an error message if a neural voice lacks its speaker or a package."""
         model, mark, speaker = voice.partition(SPEAKER_MARK)
         if mark:
             try:

@@ -77,13 +77,13 @@ _DESCRIPTOR_PATH = re.compile(r"/dev/(fd/\d+|stdin)|/proc/(self|\d+)/fd/\d+")
 def describe_end(goal: Goal) -> str:
     """Return a one-line description of how a goal ended."""
     words = printable(goal.message or goal.state.name)
-    if goal.by and f"by goal {goal.by.goal}" not in words:  # a server may have named the goal already
+    if goal.by and f"by goal {goal.by.goal}" not in words:  # the message may already name the goal
         words += f" ({_describe_cause(goal.by)})"
     return f"{printable(goal.id)}: {words}" if goal.id else words
 
 
 def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
-    """Return all details of a goal, with one field per line. `now` is a Unix timestamp."""
+    """Return all details of a goal, with one field per line."""
     state = screen.coloured(goal.state.name, goal.state)
     rows = [
         ("id", printable(goal.id)),
@@ -115,7 +115,7 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
 
 
 def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
-    """Return the lines of `talk status`. `now` is a Unix timestamp."""
+    """Return the lines of `talk status`."""
     server = status.server
     screen = replace(screen, boot=str(server.get("boot")))
     uptime = server.get("uptime")
@@ -178,7 +178,10 @@ def format_duration(seconds: float) -> str:
 
 
 def _goal_table(label: str, goals: Sequence[Goal], id_columns: int, screen: Screen, now: float) -> list[str]:
-    """Return one line for each goal, cut to the width of the terminal. The first one starts with the label."""
+    """Return one line for each goal, cut to the width of the terminal.
+
+    The first one starts with the label.
+    """
     labels = [label, *[""] * (len(goals) - 1)]
     heads = [
         _pad_label(name) + _head_columns(goal, id_columns, screen) for name, goal in zip(labels, goals, strict=True)
@@ -191,7 +194,7 @@ def _goal_table(label: str, goals: Sequence[Goal], id_columns: int, screen: Scre
 
 
 def _head_columns(goal: Goal, id_columns: int, screen: Screen) -> str:
-    """Return the columns before a goal's text: its end time if it has ended, its id and its state."""
+    """Return the columns before a goal's text, such as its id and state."""
     goal_id = pad(screen.goal_id(goal.id), id_columns)
     head = f"{goal_id}{COLUMN_GAP}{screen.coloured(pad(goal.state.name, 9), goal.state)}{COLUMN_GAP}"
     return f"{clock_time(goal.ended_at)}{COLUMN_GAP}{head}" if goal.state.terminal else head
@@ -201,31 +204,37 @@ def _tail_forms(goal: Goal, screen: Screen, now: float) -> list[str]:
     """Return alternative texts for the last column of a goal's line, longest first."""
     if goal.state.terminal:
         return listed_reason_forms(goal, screen)
-    # The sender is the most important detail. The others are left out, beginning with the last one, if they don't fit.
+    # The sender is the most important detail. If there is no room, the other details are left out, the last one first.
     senders, details = sender_forms(goal.client, screen), _unfinished_details(goal, now)
     kept = range(len(details), -1, -1)
     return [", ".join([f"from {sender}", *details[:count]]) for count in kept for sender in senders]
 
 
 def quoted_text(goal: Goal, limit: int | None = None) -> str:
-    """Return a goal's text in quotes, cut to `limit` characters, or a placeholder if it is no longer kept."""
+    """Return a goal's text in quotes, or a placeholder if it is no longer kept."""
     return _quote(_shown_text(goal), limit) or TEXT_NOT_KEPT
 
 
 def _shown_text(goal: Goal) -> str | None:
-    """Return a goal's text, with an ellipsis if it may still grow, or None if it is no longer kept."""
+    """Return a goal's text, with an ellipsis if it may still grow.
+
+    Return None if the text is no longer kept.
+    """
     return goal.text + ELLIPSIS if goal.text is not None and goal.more and not goal.state.terminal else goal.text
 
 
 def _interruptions(goal: Goal) -> list[str]:
-    """Return why an unfinished goal is silent at the moment, or an empty list."""
+    """Return why an unfinished goal is silent at the moment, if it is."""
     if goal.state.terminal:
         return []
     return ["paused"] * goal.paused + ["waiting for text"] * goal.waits
 
 
 def _quote(text: str | None, limit: int | None = None) -> str | None:
-    """Escape a text, cut it to `limit` characters and put it in quotes. Return None if the text is None."""
+    """Escape a text, cut it to `limit` characters and put it in quotes.
+
+    Return None if the text is None.
+    """
     return None if text is None else f'"{printable(text, limit)}"'
 
 
@@ -242,7 +251,10 @@ def _unfinished_details(goal: Goal, now: float) -> list[str]:
 
 
 def _describe_time_left(goal: Goal, now: float) -> str | None:
-    """Describe how much time a pending goal has left before it expires. Return None if it has no ttl."""
+    """Describe how much time a pending goal has left before it expires.
+
+    Return None if it has no ttl.
+    """
     if goal.state is not State.PENDING or not goal.ttl or goal.queued_at is None:
         return None
     left = max(0.0, goal.queued_at + goal.ttl - now)
@@ -263,11 +275,10 @@ def _describe_sender(sender: Sender | None) -> str:
 
 
 def sender_forms(sender: Sender | None, screen: Screen) -> list[str]:
-    """Return alternative descriptions of a sender, longest first, so that the first one that fits can be shown.
+    """Return alternative descriptions of a sender, longest first.
 
-    The command and the process id are only included with `screen.long`.
-
-    The name that the sender has chosen comes first. It is in quotes because it isn't verified.
+    The command and the process id are only included with `screen.long`. The name that the sender has
+    chosen comes first. It is in quotes because it isn't verified.
     """
     if sender is None:
         return [_UNKNOWN_SENDER]
@@ -285,14 +296,20 @@ def _describe_cause(by: By) -> str:
 
 
 def listed_reason_forms(goal: Goal, screen: Screen) -> list[str]:
-    """Return descriptions of why a goal ended, longest first. The duration is only shown with `screen.long`."""
+    """Return descriptions of why a goal ended, longest first.
+
+    The duration is only shown with `screen.long`.
+    """
     if goal.state is State.SUCCEEDED and not screen.long:
         return _muted_note(goal) or [""]
     return reason_forms(goal, screen)
 
 
 def reason_forms(goal: Goal, screen: Screen) -> list[str]:
-    """Return descriptions of why a goal ended and who ended it, longest first, or the duration of a success."""
+    """Return descriptions of why a goal ended, longest first.
+
+    For a success, return the duration instead.
+    """
     if goal.state is State.SUCCEEDED:
         return [", ".join([*([] if goal.duration is None else [f"{goal.duration:.1f} s"]), *_muted_note(goal)])]
     reason = printable(goal.reason or goal.state.name.lower())
@@ -311,7 +328,7 @@ def reason_forms(goal: Goal, screen: Screen) -> list[str]:
 
 
 def _message_details(goal: Goal) -> str:
-    """Return the part of a goal's message that adds to its reason, or an empty string."""
+    """Return the part of a goal's message that adds to its reason."""
     if goal.state not in {State.ABORTED, State.REJECTED} and goal.by is not None:
         return ""
     details = message_details(goal.message)
@@ -325,17 +342,17 @@ def _describe_output(output: Output) -> str:
 
 
 def _muted_note(goal: Goal) -> list[str]:
-    """Return `["muted"]` if the goal's output was muted, otherwise an empty list."""
+    """Return a list with a note if the goal's output was muted."""
     return ["muted"] if goal.output and goal.output.muted else []
 
 
 def _sender_command(sender: Sender) -> str:
-    """Return the command line of the sender's parent or, if unknown, the sender's program, cut to 60 characters."""
+    """Return the command line of the sender's parent, or else the sender's program."""
     return printable(sender.parent or sender.command or "a program", _SENDER_COMMAND_CHARS)
 
 
 def _script_name(sender: Sender) -> str:
-    """Return the name of the sender's script, without its directory, interpreter and arguments."""
+    """Return the name of the sender's script, without its directory."""
     words = (sender.parent or "").split()
     if not words:
         return _sender_command(sender)
@@ -345,7 +362,7 @@ def _script_name(sender: Sender) -> str:
 
 
 def _launched_command(words: list[str]) -> list[str]:
-    """Return the command line that a launcher such as `bash` or `sudo` runs, or an empty list.
+    """Return the command line that a launcher such as `bash` or `sudo` runs.
 
     The list is empty if the command isn't a launcher, or if the script has no name.
     """
@@ -378,7 +395,7 @@ def _file_name(path: str) -> str:
 
 
 def _format_status_fields(server: JsonObject, *names: str) -> list[str]:
-    """Format fields of the server's status. Optional fields without a value are left out."""
+    """Format fields of the server's status, without empty optional ones."""
     shown = [each for each in names if server.get(each) or each not in _OPTIONAL_FIELDS]
     return [_FIELD_FORMATS.get(each, f"{each} {{}}").format(_format_status_field(server, each)) for each in shown]
 
@@ -391,7 +408,7 @@ def _format_value(value: object) -> str:
 
 
 def clock_time(seconds: float | None) -> str:
-    """Format a timestamp as the local time of day, or as dashes if it is None."""
+    """Format a timestamp as the local time of day, or as dashes if it is unknown."""
     return "--:--:--" if seconds is None else time.strftime("%H:%M:%S", time.localtime(seconds))
 
 
@@ -401,6 +418,6 @@ def _format_date_and_time(seconds: float | None) -> str | None:
 
 
 def _format_status_field(server: JsonObject, name: str) -> str:
-    """Format the value of a field of the server's status, or return "default" if it is None."""
+    """Format the value of a field of the server's status."""
     value = server.get(name)
     return "default" if value is None else printable(_format_value(value), _LISTED_TEXT_CHARS)

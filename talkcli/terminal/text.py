@@ -58,18 +58,18 @@ _STATE_COLOURS = {
 
 @frozen
 class Screen:
-    """The width and the colour support of the output, and how much detail to show."""
+    """The width and colours of the output, and the level of detail to show."""
 
     #: the number of columns, or None if the output isn't a terminal and lines can have any length
     width: int | None = None
     colour: bool = False
     #: whether to show whole ids, and the commands and process ids of senders
     long: bool = False
-    #: the server's boot id; goals with this id are shown by their numbers
+    #: the server's boot id. Goals with this prefix are shown by their numbers.
     boot: str = ""
 
     def columns_left(self, taken: int) -> int | None:
-        """Return how many columns remain if `taken` columns are used, or None if there is no limit."""
+        """Return how many columns remain if `taken` columns are used."""
         return None if self.width is None else max(self.width, MIN_COLUMNS) - taken
 
     def fit_name(self, name: str, room: int = _MIN_NAME_COLUMNS, share: int = 4) -> str:
@@ -91,13 +91,16 @@ class Screen:
         return self.fit_name(number if number.isdecimal() else goal_id, _MIN_ID_COLUMNS, 8)
 
     def coloured(self, text: str, state: State | None) -> str:
-        """Return the text in the colour of a state, or in bold if the state is None, if the output has colours."""
+        """Colour a text by its state, or make it bold if the state is None.
+
+        Without colours, return it unchanged.
+        """
         code = _STATE_COLOURS.get(state) if state is not None else "1"
         return f"\x1b[{code}m{text}\x1b[0m" if self.colour and code else text
 
 
 def printable(text: str, limit: int | None = None) -> str:
-    """Cut a text after `limit` characters, and escape all invisible characters and backslashes in it."""
+    """Cut a text after `limit` characters, and escape invisible ones in it."""
     kept = text[:limit]
     if not (kept.isascii() and kept.isprintable() and "\\" not in kept):
         kept = "".join(map(_escape, kept))
@@ -123,7 +126,7 @@ def width(text: str) -> int:
 
 
 def cut(text: str, columns: int | None) -> str:
-    """Cut a text to this many columns, and end it with an ellipsis if it was cut.
+    """Cut a text that is too long, and add an ellipsis.
 
     The text must not contain colour codes.
     """
@@ -134,14 +137,14 @@ def cut(text: str, columns: int | None) -> str:
 
 
 def shorten(text: str, columns: int | None) -> str:
-    """Cut a text to this many columns, but keep the closing quote of a quoted text."""
+    """Cut a text that is too long, but keep its closing quote."""
     if columns is None or not (len(text) > 1 and text[0] == text[-1] == '"'):
         return cut(text, columns)
     return f'"{cut(text[1:-1], columns - 2)}"'
 
 
 def pad(text: str, columns: int) -> str:
-    """Pad a text with spaces to this many columns."""
+    """Pad a text with spaces to a number of columns."""
     return text + " " * (columns - width(text))
 
 
@@ -154,7 +157,7 @@ def longest_fitting(forms: Sequence[str], columns: int | None) -> str:
 
 
 def room_beside(text: str, columns: int, screen: Screen) -> int:
-    """Return how many columns the details beside a text may take, so that enough of the text can be shown.
+    """Return how many columns the details beside a text may take.
 
     They leave at least half of the line to the text, or 16 columns if whole ids are shown.
     """
@@ -162,7 +165,7 @@ def room_beside(text: str, columns: int, screen: Screen) -> int:
 
 
 def fit_row(head: str, text: str, details: Sequence[str], text_columns: int, screen: Screen) -> str:
-    """Format a row of a table so that it fits the screen and shows as much of the text as possible.
+    """Format a row of a table so that it fits the screen.
 
     Args:
         head: the columns before the text.
@@ -181,7 +184,9 @@ def fit_row(head: str, text: str, details: Sequence[str], text_columns: int, scr
 
 
 def wrap(pieces: Sequence[str], head: str, screen: Screen) -> list[str]:
-    """Join pieces of text with spaces, and wrap them into lines that fit the screen. `head` starts the first line.
+    """Join pieces of text, and wrap them to fit the screen.
+
+    `head` starts the first line.
 
     The other lines are indented by its width. Lines are only broken between pieces.
     """
@@ -196,7 +201,7 @@ def wrap(pieces: Sequence[str], head: str, screen: Screen) -> list[str]:
 
 
 class MeasuredText:
-    """A text with precomputed character widths, so that parts of it can be extracted quickly."""
+    """A text with precomputed character widths."""
 
     def __init__(self, text: str) -> None:
         self._shown: list[str] = []
@@ -219,11 +224,11 @@ class MeasuredText:
         return "".join(self._shown)
 
     def split(self, heard: int) -> tuple[str, str]:
-        """Return the escaped text in two parts: the first `heard` characters, and the rest."""
+        """Split the escaped text after the first `heard` characters."""
         return self._slice(0, heard), self._slice(heard, len(self._shown))
 
     def view(self, start: int, end: int, columns: int) -> tuple[str, str, str]:
-        """Return as much of the text around a word as fits into this many columns.
+        """Return as much of the text around a word as fits into `columns`.
 
         Args:
             start: the index of the word's first character.
@@ -255,19 +260,16 @@ class MeasuredText:
         """Return the characters from `start` to `end`, with invisible ones escaped."""
         return "".join(self._shown[start:end])
 
-    def _first_shown(self, column: int, start: int) -> int:
-        """Return the index of the first visible character if all columns before `column` are cut.
-
-        The index is never greater than `start`.
-        """
+    def _first_shown(self, column: int, last: int) -> int:
+        """Return the index of the first character to show after an ellipsis."""
         if column <= 0:
             return 0
         # The ellipsis needs one more column. The first visible character must not be a combining mark.
-        begins = (place for place in range(start) if column < self._columns[place] < self._columns[place + 1])
-        return next(begins, start)
+        begins = (place for place in range(last) if column < self._columns[place] < self._columns[place + 1])
+        return next(begins, last)
 
     def _count_fitting(self, columns: int) -> int:
-        """Return how many characters from the start of the text fit into this many columns."""
+        """Return how many characters at the start of the text fit into `columns`."""
         return sum(each <= columns for each in self._columns) - 1
 
 

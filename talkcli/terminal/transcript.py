@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 _FIRST_NAME_COLUMNS = 8
 #: The initial width of the id column, which is enough for a server's first 999 goals.
 _FIRST_ID_COLUMNS = 3
-#: The width up to which the robot and id columns grow.
+#: The maximum width of the robot and id columns.
 _MAX_NAME_COLUMNS = 20
 #: The indentation of continuation lines, which is the width of the time column.
 _INDENT_COLUMNS = 10
@@ -57,7 +57,7 @@ class ColumnWidths:
         self._ids, self._robots = _FIRST_ID_COLUMNS, _FIRST_NAME_COLUMNS
 
     def pad_robot(self, name: str, screen: Screen) -> str:
-        """Pad a robot's name to the width of its column, which is widened if necessary.
+        """Pad a robot's name, and widen its column if necessary.
 
         The name takes up at most a sixth of the terminal.
         """
@@ -66,7 +66,7 @@ class ColumnWidths:
         return pad(shown, self._robots)
 
     def pad_goal_id(self, goal_id: str, screen: Screen) -> str:
-        """Pad a goal id to the width of its column, which is widened if necessary."""
+        """Shorten and pad a goal id, and widen its column if necessary."""
         shown = screen.goal_id(goal_id)
         self._ids = max(self._ids, _FIRST_NAME_COLUMNS * screen.long, min(width(shown), _MAX_NAME_COLUMNS))
         return pad(shown, self._ids)
@@ -106,7 +106,10 @@ class Transcript:
         self._widths = widths or ColumnWidths()
 
     def lines(self, event: Event, screen: Screen, now: float) -> list[str]:
-        """Return the lines that show an event, and remember its goal. `now` is shown if the event has no time."""
+        """Return the lines that show an event, and remember its goal.
+
+        `now` is shown if the event has no time.
+        """
         if isinstance(event, Snapshot):
             self._boot = str(event.status.server.get("boot"))
         screen = replace(screen, boot=self._boot)
@@ -129,7 +132,7 @@ class Transcript:
         return [self._head_columns(event.at or now, "word", None, event.id, screen) + word] * self._with_words
 
     def _format_snapshot(self, event: Snapshot, screen: Screen, now: float) -> list[str]:
-        """Remember the server's state, and return a line about the server and the lines of all unfinished goals."""
+        """Remember the server's state, and return the lines that show it."""
         status = event.status
         goals = unfinished(status)
         for goal in goals:
@@ -147,7 +150,7 @@ class Transcript:
         return lines
 
     def _format_state_change(self, event: StateChanged, screen: Screen, now: float) -> list[str]:
-        """Remember or forget a goal after a change of its state, and return the lines that show the change."""
+        """Return the lines that show a goal's new state, and remember the goal until it ends."""
         if event.goal is not None:
             self._goals[event.id] = event.goal
             if len(self._goals) > _MAX_REMEMBERED_GOALS:  # the event for the end of the oldest goal was probably missed
@@ -188,7 +191,7 @@ class Transcript:
         return lines
 
     def _format_pause(self, event: PausedChanged, screen: Screen, now: float) -> str:
-        """Remember whether speech is paused, and return the line that says so."""
+        """Remember whether speech is paused, and return a line that says so."""
         self._paused = event.paused
         name = "paused" if event.paused else "resumed"
         head = self._head_columns(event.at or now, name, State.PREEMPTING, event.id or "", screen)
@@ -197,7 +200,10 @@ class Transcript:
         return (head + longest_fitting(forms, screen.columns_left(width(head)))).rstrip()
 
     def _format_goal(self, goal: Goal, state: State, at: float, screen: Screen) -> list[str]:
-        """Return the lines that show a goal with its state, text, and sender or reason. `at` is a timestamp."""
+        """Return the lines that show a goal.
+
+        `at` is a timestamp.
+        """
         head = self._head_columns(at, state.name, state, goal.id, screen)
         ended = state.terminal
         forms = reason_forms(goal, screen) if ended else sender_forms(goal.client, screen)
@@ -215,7 +221,7 @@ class Transcript:
         return [fit_row(head, text, forms, columns * 3 // 4, screen)]
 
     def _head_columns(self, at: float, word: str, state: State | None, goal_id: str, screen: Screen) -> str:
-        """Return the first columns of a line: time, robot, a word in the colour of the state, and goal id."""
+        """Return the first columns of a line, up to the goal's id."""
         robot = [] if self._robot is None else [self._widths.pad_robot(self._robot, screen)]
         cells = (screen.coloured(pad(word, 10), state), self._widths.pad_goal_id(goal_id, screen))
         return COLUMN_GAP.join((clock_time(at), *robot, *cells, ""))
@@ -228,7 +234,7 @@ def _complete_chars(text: str, start: int) -> int:
 
 
 def log_lines(goals: Sequence[Goal], screen: Screen, now: float) -> list[str]:
-    """Return one line for each ended goal, for `talk log`. `now` is a Unix timestamp."""
+    """Return one line for each ended goal, for `talk log`."""
     if not goals:
         return []
     today = time.localtime(now)[:3]

@@ -125,9 +125,9 @@ def _check_new_goals(events: Iterable[Message]) -> None:
         if event["event"] != "state":
             continue
         seen[event["id"]] = event["state"]
-        newcomer = (event.get("goal", {}).get("by") or {}).get("goal")
-        if newcomer is not None and event["state"] in {"RECALLED", "PREEMPTED"}:
-            error = f"{event['id']} ended by {newcomer}, which was {seen.get(newcomer)}"
+        new_goal = (event.get("goal", {}).get("by") or {}).get("goal")
+        if new_goal is not None and event["state"] in {"RECALLED", "PREEMPTED"}:
+            error = f"{event['id']} ended by {new_goal}, which was {seen.get(new_goal)}"
             # A stopped goal may end long after the new goal was recalled itself.
             allowed = {"PENDING"} if event["state"] == "RECALLED" else {"PENDING", "RECALLED"}
-            assert seen.get(newcomer) in allowed, error
+            assert seen.get(new_goal) in allowed, error

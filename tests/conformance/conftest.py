@@ -20,16 +20,16 @@ def joe(tmp_path_factory: pytest.TempPathFactory) -> Joe:
 
     Each sentence starts with at least 36 ms of silence, as after a comma, so that the monitor drops no sound.
     """
-    place = tmp_path_factory.mktemp("voices")
-    place.chmod(0o755)
+    folder = tmp_path_factory.mktemp("voices")
+    folder.chmod(0o755)
     path = real_voice()
-    link_without_noise(path, place)
-    config_path = place / f"{path.name}.json"
+    link_without_noise(path, folder)
+    config_path = folder / f"{path.name}.json"
     config = json.loads(config_path.read_text())
     numbers = config["phoneme_id_map"]
     numbers["^"] += [*numbers["_"], *numbers[","]]
     config_path.write_text(json.dumps(config))
-    return Joe(str(place), str(tmp_path_factory.mktemp("cache")))
+    return Joe(str(folder), str(tmp_path_factory.mktemp("cache")))
 
 
 @pytest.fixture(params=["espeak", pytest.param("joe", marks=pytest.mark.slow)])

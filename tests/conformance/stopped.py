@@ -85,7 +85,7 @@ def likeliest(
     loud = np.flatnonzero(np.abs(samples.astype(np.int32)) > LOUD)
     silence = np.diff(loud, prepend=-DROPPED)
     possible = silence >= _SILENCE
-    possible[[place for place in np.searchsorted(loud, ends) if place < len(loud)]] = True
+    possible[[index for index in np.searchsorted(loud, ends) if index < len(loud)]] = True
     starts = loud[possible]
     before = np.minimum(silence[possible] - 1, DROPPED)
     candidates = []
@@ -95,7 +95,7 @@ def likeliest(
         for start, quiet in zip(starts.tolist(), before.tolist(), strict=True):
             same = _same(samples[start : start + len(wanted)], wanted)
             candidates += [(same, max(0, start - quiet), references)] if same else []
-    for _, start, references in sorted(candidates, key=lambda place: -place[0]):
+    for _, start, references in sorted(candidates, key=lambda candidate: -candidate[0]):
         yield start, references
 
 

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 START = 0.5
 
 
-def start_speaking(talk: Talk, *words: str) -> tuple[Process, str]:
+def start_speaking(talk: Talk, *options: str) -> tuple[Process, str]:
     """Start a client whose goal never ends, wait for its first word, and return the client and the goal's id."""
-    client = talk.start("say", *words, "--", "never-ends words=1")
+    client = talk.start("say", *options, "--", "never-ends words=1")
     goal_id = str(talk.watcher.wait_for(None, "ACTIVE")["id"])
     talk.watcher.wait_for_word(goal_id)
     return client, goal_id
@@ -44,7 +44,7 @@ def test_row_07_clients_of_a_killed_server_report_their_goals_lost(scripted: Tal
     for client in (sayer, behind):
         done = scripted.finish(client)
         assert done.code == 12
-        assert_within(done.seconds, 1, "LOST")
+        assert_within(done.seconds, 1, "the end of a client whose server was killed")
         assert "may still be spoken" in done.err
     goal = json.loads(done.out)
     assert (goal["id"], goal["state"], goal["status"], goal["reason"]) == (pending_id, "LOST", 9, "lost")
@@ -100,22 +100,22 @@ def test_row_10_a_timeout_includes_the_time_in_the_queue(scripted: Talk) -> None
     assert scripted.request("status")["active"]["state"] == "ACTIVE"  # `wait` cancels nothing
 
 
-@pytest.mark.parametrize("says", [GREETING, b""], ids=["after the greeting", "before it"])
+@pytest.mark.parametrize("greeting", [GREETING, b""], ids=["after the greeting", "before it"])
 @limits()
-def test_a_client_times_out_if_the_server_does_not_answer(says: bytes) -> None:
-    with short_directory() as home, FakeServer(f"{home}/s", [says]):
+def test_a_client_times_out_if_the_server_does_not_answer(greeting: bytes) -> None:
+    with short_directory() as home, FakeServer(f"{home}/s", [greeting]):
         started_at = time.monotonic()
         done = _talk(home, "say", "--wait", "--timeout", "0.5", "--", "hello")
         seconds = time.monotonic() - started_at
     # Without a greeting, the client sends no request, and reports that there is no server.
-    assert done.code == (124 if says else 3), done
-    assert ("timed out after 0.5 s: the say request was sent" in done.err) == bool(says)
+    assert done.code == (124 if greeting else 3), done
+    assert ("timed out after 0.5 s: the say request was sent" in done.err) == bool(greeting)
     assert_within(seconds, 0.5 + 1 + START, "a timeout of 0.5 s")
 
 
-def _talk(home: str, *words: str) -> Ended:
+def _talk(home: str, *args: str) -> Ended:
     """Run `talk` in a new process, without a fork."""
-    return run([*TALK, *words], environment(home, TALK_SOCKET=f"{home}/s"), cwd="/")
+    return run([*TALK, *args], environment(home, TALK_SOCKET=f"{home}/s"), cwd="/")
 
 
 def test_row_15_a_goal_is_spoken_even_if_its_client_disconnects_at_once(scripted: Talk) -> None:
@@ -156,8 +156,8 @@ def test_row_31_any_process_can_get_the_result_of_an_ended_goal(scripted: Talk) 
     assert (done.code, goal["id"], goal["state"], goal["reason"]) == (4, ids[1], "ABORTED", "audio_lost")
     scripted.request("cancel", ids=["early"])
     scripted.request("say", text="recalled", id="early")
-    for words, code in ((("early", ids[1]), 6), ((ids[1], "early"), 4)):
-        assert scripted.run("wait", ids[0], *words, ids[2]).code == code  # of the first goal that did not succeed
+    for goal_ids, code in ((("early", ids[1]), 6), ((ids[1], "early"), 4)):
+        assert scripted.run("wait", ids[0], *goal_ids, ids[2]).code == code  # of the first goal that did not succeed
 
 
 @pytest.mark.parametrize("command", ["say", "wait"])
@@ -184,9 +184,9 @@ def test_row_33_ctrl_c_cancels_only_the_clients_own_goal(scripted: Talk, command
 @limits()
 def test_row_33_a_signal_stops_a_client_that_waits_for_the_greeting() -> None:
     with short_directory() as home, FakeServer(f"{home}/s", []) as server:
-        for words in (["status"], ["wait"], ["say", "--wait", "hello"]):
+        for args in (["status"], ["wait"], ["say", "--wait", "hello"]):
             with subprocess.Popen(
-                [sys.executable, "-m", "talkcli", *words],
+                [sys.executable, "-m", "talkcli", *args],
                 env=environment(home, TALK_SOCKET=f"{home}/s"),
                 stderr=subprocess.PIPE,
                 text=True,
@@ -195,8 +195,8 @@ def test_row_33_a_signal_stops_a_client_that_waits_for_the_greeting() -> None:
                 client.send_signal(signal.SIGINT)
                 started_at = time.monotonic()
                 _, err = client.communicate(timeout=20)
-            assert client.returncode == 130, (words, err)
-            assert_within(time.monotonic() - started_at, 1 + START, f"the end of {words} after a signal")
+            assert client.returncode == 130, (args, err)
+            assert_within(time.monotonic() - started_at, 1 + START, f"the end of {args} after a signal")
             assert "Traceback" not in err
 
 
@@ -226,11 +226,11 @@ def _version() -> float:
     return time.monotonic() - started_at
 
 
-@pytest.mark.parametrize("words", [["status"], ["say", "-w", "hello"], ["wait"]])
-def test_row_35_a_missing_server_is_reported_at_once(words: Sequence[str]) -> None:
+@pytest.mark.parametrize("args", [["status"], ["say", "-w", "hello"], ["wait"]])
+def test_row_35_a_missing_server_is_reported_at_once(args: Sequence[str]) -> None:
     with short_directory() as home, limits(_version):
         started_at = time.monotonic()
-        done = _talk(home, *words)
+        done = _talk(home, *args)
         seconds = time.monotonic() - started_at
         assert (done.code, done.out) == (3, "")
         assert f"{home}/s: not found" in done.err
@@ -246,8 +246,8 @@ def test_row_46_clients_do_not_wait_forever_for_a_frozen_server(scripted: Talk) 
     started_at = time.monotonic()
     try:
         second = scripted.start("serve")
-        others = [scripted.start(*words) for words in (["status"], ["cancel"], ["say", "hello"], ["--json", "wait"])]
-        ended = [scripted.finish(client) for client in others]
+        clients = [scripted.start(*args) for args in (["status"], ["cancel"], ["say", "hello"], ["--json", "wait"])]
+        ended = [scripted.finish(client) for client in clients]
         assert time.monotonic() - started_at < 6
         for done in ended:
             assert (done.code, done.out) == (3, ""), done

@@ -145,8 +145,8 @@ def test_row_12_feedback_names_its_goal_and_precedes_the_result(make_talk: MakeT
 
 
 def test_row_14_a_cancel_without_any_goals_succeeds(scripted: Talk) -> None:
-    for words in ([], ["--current"]):
-        done = scripted.run("cancel", *words)
+    for options in ([], ["--current"]):
+        done = scripted.run("cancel", *options)
         assert (done.code, done.out, done.err) == (0, "", "")
 
 
@@ -154,8 +154,8 @@ def test_row_19_unknown_ids_are_errors_and_ended_goals_do_not_change(scripted: T
     ended = scripted.run("say", "--wait", "length=0").id
     before = scripted.goal(ended)
     active, pending = (scripted.run("say", f"never-ends {name}").id for name in ("active", "pending"))
-    for words in (["cancel", "none-7"], ["wait", "none-7"], ["status", "none-7"], ["cancel", "--before", "none-7"]):
-        done = scripted.run(*words)
+    for args in (["cancel", "none-7"], ["wait", "none-7"], ["status", "none-7"], ["cancel", "--before", "none-7"]):
+        done = scripted.run(*args)
         assert (done.code, done.out) == (8, ""), done
         assert "none-7" in done.err
     unknown_too = scripted.run("wait", active, "none-7")

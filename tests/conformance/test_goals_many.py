@@ -122,7 +122,7 @@ def test_row_26_the_last_of_a_thousand_preempting_goals_is_spoken_whole(make_tal
         assert {goals[goal_id]["reason"] for goal_id in others} == {"preempted"}
         assert_event_order(talk)
         talk.stop()
-        assert_within(seconds, 1.0, "taking a thousand goals")
+        assert_within(seconds, 1.0, "accepting a thousand goals")
 
 
 def _send_batch(wire: Wire, numbers: range) -> None:

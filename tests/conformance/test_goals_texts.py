@@ -100,19 +100,19 @@ def test_the_error_for_an_oversized_input_is_accurate(scripted: Talk) -> None:
 def test_invalid_utf8_bytes_are_skipped_and_reported(scripted: Talk) -> None:
     data = "length=0 Grüße:\n日本\n".encode() + "Grüße".encode("latin-1") + b" \xed\xa0\x80!"
     text = "length=0 Grüße:\n日本\nGr\ufffd\ufffde \ufffd\ufffd\ufffd!"
-    note = "talk: line 3, column 3: the byte 0xfc is not valid UTF-8, so it is not spoken (4 more like it)\n"
+    note = "talk: line 3, column 3: the byte 0xfc is not valid UTF-8 and is skipped (4 more like it)\n"
     for options, expected in ((["--json"], note), (["--json", "-q"], "")):
-        for words, typed in (([b"--", data], b""), ([b"-"], data)):
-            line: list[str | bytes] = [*TALK, *options, "say", "--wait", *words]
-            done = subprocess.run(line, input=typed, env=scripted.env, capture_output=True, timeout=20, check=False)
+        for args, stdin in (([b"--", data], b""), ([b"-"], data)):
+            command: list[str | bytes] = [*TALK, *options, "say", "--wait", *args]
+            done = subprocess.run(command, input=stdin, env=scripted.env, capture_output=True, timeout=20, check=False)
             goal = json.loads(done.stdout)
             assert (done.returncode, goal["state"], goal["text"]) == (0, "SUCCEEDED", text)
             assert done.stderr.decode() == expected
 
 
 def test_invalid_utf8_bytes_are_silent_and_are_not_words(talk: Talk) -> None:
-    line: list[str | bytes] = [*TALK, "say", "--feedback", "--", b"battery \xff low, it\xffs \xff", "now"]
-    done = subprocess.run(line, env=talk.env, capture_output=True, text=True, timeout=20, check=False)
+    command: list[str | bytes] = [*TALK, "say", "--feedback", "--", b"battery \xff low, it\xffs \xff", "now"]
+    done = subprocess.run(command, env=talk.env, capture_output=True, text=True, timeout=20, check=False)
     words = [line.split()[-1] for line in done.stdout.splitlines() if " word " in line]
     assert (done.returncode, words) == (0, ["battery", "low", "it", "s", "now"])
     alone = talk.run("say", "--wait", "--", "\udcff")

@@ -263,8 +263,8 @@ def test_row_24_a_preempting_goal_is_heard_after_the_old_one_is_silent(
 def test_row_25_a_preempting_goal_goes_before_the_queued_ones(talk: Talk, voice: Voice) -> None:
     first, *waiting = [send(talk, text) for text in (LONG, LOW, HOME)]
     await_word(talk, first)
-    newcomer = talk.run("say", "--preempt", "--wait", "--", HELP)
-    assert (newcomer.code, newcomer.err) == (0, "")
+    urgent = talk.run("say", "--preempt", "--wait", "--", HELP)
+    assert (urgent.code, urgent.err) == (0, "")
     assert talk.run("wait", *waiting).code == 0
     assert talk.watcher.states(first) == STOPPED
     assert all(talk.watcher.states(goal_id) == SPOKEN for goal_id in waiting)

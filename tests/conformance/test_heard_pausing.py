@@ -195,13 +195,13 @@ def test_row_43_a_preempting_goal_ends_the_paused_one_and_waits(talk: Talk, voic
     pause(talk)
     lower = submit(talk, HOME, preempt=True)["id"]
     assert talk.goal(paused)["paused"] is True  # a lower priority does not preempt it
-    newcomer = send(talk, LOW, preempt=True, priority=1)
+    urgent = send(talk, LOW, preempt=True, priority=1)
     assert talk.watcher.wait_for_terminal(paused) == "PREEMPTED"
-    assert talk.goal(paused)["by"] == {"goal": newcomer}
+    assert talk.goal(paused)["by"] == {"goal": urgent}
     assert_silent_for(talk, time.monotonic(), 0.5)
-    assert talk.goal(newcomer)["state"] == "PENDING"
+    assert talk.goal(urgent)["state"] == "PENDING"
     resume(talk)
-    assert talk.watcher.wait_for_terminal(newcomer) == "SUCCEEDED"
+    assert talk.watcher.wait_for_terminal(urgent) == "SUCCEEDED"
     assert talk.watcher.wait_for_terminal(lower) == "RECALLED"
     stopped.assert_heard_after_stop(heard(talk), LONG, [LOW], voice=voice)
     assert_event_order(talk)
@@ -230,12 +230,12 @@ def _assert_paused_twice(samples: Samples, reference: Samples) -> None:
     wanted = reference[begin:end]
     reached = 0
     for part in (samples[start : stop + 1] for start, stop in zip(starts, ends, strict=True)):
-        place = find_part(part, wanted, reached, round(REPEAT_LIMIT_S * RATE) + SLACK)
-        if place is None:
+        bounds = find_part(part, wanted, reached, round(REPEAT_LIMIT_S * RATE) + SLACK)
+        if bounds is None:
             compared = compare(wanted, part)
             assert compared.correlation > SAME, compared
-            place = compared.offset, compared.offset + len(part)
-        first, last = place
+            bounds = compared.offset, compared.offset + len(part)
+        first, last = bounds
         assert first >= reached - REPEAT_LIMIT_S * RATE - SLACK, f"{(reached - first) / RATE:.3f} s heard twice"
         assert extent(wanted[reached + SLACK : max(0, first - SLACK)]) is None, f"missing before {first / RATE:.3f} s"
         reached = last

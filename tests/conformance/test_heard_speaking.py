@@ -294,9 +294,9 @@ def test_word_events_of_a_neural_voice_arrive_as_the_words_are_heard(
         assert [THIRTY[word["start"] : word["end"]] for word in measured.words] == REPORTED_WORDS
         # The reported place of a word in the sound doesn't depend on the load of the machine.
         reference = joe.render_with_words(Sentence(THIRTY, rate))
-        beside = [abs(word["time"] - position(reference, word["start"])) for word in measured.words]
-        assert statistics.median(beside) <= MEDIAN, beside
-        assert max(beside) <= WORST, beside
+        errors = [abs(word["time"] - position(reference, word["start"])) for word in measured.words]
+        assert statistics.median(errors) <= MEDIAN, errors
+        assert max(errors) <= WORST, errors
         measured.assert_in_time()
 
 

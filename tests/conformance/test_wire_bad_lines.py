@@ -90,8 +90,8 @@ def talk(scripted: Talk) -> Iterator[Talk]:
 
 def descriptors(talk: Talk) -> int:
     """Return the number of descriptors that the server has open, or 0 if it is unknown."""
-    place = f"/proc/{talk.pid}/fd"
-    return len(os.listdir(place)) if os.path.isdir(place) else 0
+    folder = f"/proc/{talk.pid}/fd"
+    return len(os.listdir(folder)) if os.path.isdir(folder) else 0
 
 
 def assert_error(reply: dict[str, Any], code: str) -> None:

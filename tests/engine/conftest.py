@@ -1,4 +1,4 @@
-"""Fixtures of the engine's tests: player programs, and engine threads with a scripted process."""
+"""Fixtures for the engine's tests: player programs, and engine threads with a scripted process."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from talkcli.engine.parent import supervisor
 from tests.engine.programs import Player
-from tests.engine.threads import Thread
+from tests.engine.threads import EngineThread
 from tests.support import scripted_serve
 from tests.support.real_voice import real_voice
 
@@ -18,44 +18,44 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import Any
 
-    from tests.engine.spawned import Shared, Spawned
-    from tests.engine.threads import Start
+    from tests.engine.process import Engine, SharedEngine
+    from tests.engine.threads import StartThread
 
 
 @pytest.fixture
 def player(tmp_path: Path) -> Player:
-    """Makes player programs."""
+    """Return a maker of player programs."""
     return Player(tmp_path)
 
 
 @pytest.fixture
-def engine(shared: Shared, request: pytest.FixtureRequest) -> Spawned:
-    """Return the idle process that the tests of a module share."""
+def engine(shared: SharedEngine, request: pytest.FixtureRequest) -> Engine:
+    """Return the idle engine process that the module's tests share."""
     return shared.take(request.session.testsfailed)
 
 
 @pytest.fixture
 def scripted_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have the scripted engine started as the engine process."""
+    """Use the scripted engine as the engine process."""
     monkeypatch.setattr("talkcli.engine.parent.process.engine_command", scripted_serve.engine_command)
 
 
 @pytest.fixture
-def start(scripted_process: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:  # noqa: ARG001 - it is started
-    """Starts engine threads with the scripted engine as their process."""
+def start(scripted_process: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[StartThread]:  # noqa: ARG001 - for its effect
+    """Return a function that starts an engine thread with the scripted engine as its process."""
     with contextlib.ExitStack() as stack:
 
-        def make(begins: str = "", **limits: Any) -> Thread:
-            monkeypatch.setenv("SCRIPTED_START", begins)
+        def make(script: str = "", **limits: Any) -> EngineThread:
+            monkeypatch.setenv("SCRIPTED_START", script)
             for name, value in limits.items():
                 monkeypatch.setattr(supervisor, name, value)
-            return stack.enter_context(contextlib.closing(Thread()))
+            return stack.enter_context(contextlib.closing(EngineThread()))
 
         yield make
 
 
 @pytest.fixture(scope="session")
-def real(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Return the environment of engine processes that have a real voice, and share a cache."""
+def real_voice_env(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Return the environment for engine processes with a real neural voice. They share a cache."""
     real_voice()
     return {"XDG_CACHE_HOME": str(tmp_path_factory.mktemp("cache"))}

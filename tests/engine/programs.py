@@ -1,38 +1,38 @@
-"""Player programs made of Python code, for tests that look at the samples a player gets or have it fail."""
+"""Player programs written in Python, for tests that check the samples or need a failing player."""
 
 from __future__ import annotations
 
 import sys
 from typing import TYPE_CHECKING
 
-from tests.engine.spawned import FAST
+from tests.engine.process import FAST
 from tests.support.reference import render
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-#: A player that takes sound in real time, holds 60 ms of it, and writes it to the file in its first argument.
+#: A player that reads sound in real time, buffers 60 ms, and writes it to the file named by its first argument.
 PLAYS = """
 import os, sys, time
 heard = open(sys.argv[1], "ab", buffering=0)
-began, taken = None, 0
+started_at, taken = None, 0
 while data := os.read(0, 882):
-    began = began or time.monotonic()
+    started_at = started_at or time.monotonic()
     taken += len(data)
     heard.write(data)
     {during}
-    time.sleep(max(0, began + taken / 44100 - 0.06 - time.monotonic()))
+    time.sleep(max(0, started_at + taken / 44100 - 0.06 - time.monotonic()))
 time.sleep(0.06)
 {after}
 """
-#: Never takes anything.
+#: A player that never reads.
 NEVER_READS = "import time\ntime.sleep(100)"
-#: Takes everything at once, and ends well.
+#: A player that reads everything at once and exits with status 0.
 SWALLOWS = "import os\nwhile os.read(0, 65536): pass"
 
 
 class Player:
-    """Makes player programs out of Python code."""
+    """A maker of player programs. They write the samples to the file `heard`."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -52,15 +52,15 @@ class Player:
 
 
 def sound(text: str) -> bytes:
-    """Return all samples of the first sentence of an engine process."""
+    """Return all samples of a text that is an engine process's first sentence."""
     return render([text], rate=FAST)[0].astype("<i2").tobytes()
 
 
 def without_silence(heard: bytes, sentence: bytes) -> bytes:
-    """Return what was heard without the zeros at the place where it first differs from the sentence."""
-    same = (pair[0] == pair[1] for pair in zip(heard, sentence, strict=False))
-    begin = next((at for at, each in enumerate(same) if not each), len(sentence)) // 2 * 2
-    end = begin
+    """Return the heard samples without the zeros where they first differ from the sentence."""
+    pairs = enumerate(zip(heard, sentence, strict=False))
+    start = next((index for index, (a, b) in pairs if a != b), len(sentence)) // 2 * 2
+    end = start
     while heard[end : end + 2] == b"\0\0":
         end += 2
-    return heard[:begin] + heard[end:]
+    return heard[:start] + heard[end:]

@@ -10,7 +10,7 @@ from array import array
 from typing import TYPE_CHECKING, Any, cast
 
 import pytest
-from pyttsx3.engine import Engine
+import pyttsx3.engine
 
 from talkcli import install
 from talkcli.engine import protocol
@@ -18,7 +18,7 @@ from talkcli.engine.child.driver import register_driver
 from talkcli.engine.child.players.base import CannotSpeak
 from talkcli.engine.child.players.chooser import PlayerChooser
 from talkcli.engine.voices import UnknownVoice
-from tests.engine.spawned import Shared, Spawned
+from tests.engine.process import Engine, SharedEngine
 from tests.engine.test_synthesizer_contract import Scripted
 from tests.support.timing import assert_within, limits
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from talkcli.engine.child.runner import GoalRunner
     from talkcli.engine.child.synthesizers.base import SampleSink, SpeechSettings, Synthesizer
 
-#: The common part of all drivers here. It has no properties, and registers the driver with pyttsx3.
+#: The part that all drivers here share. It has no settable properties, and registers the driver with pyttsx3.
 _DRIVER = """
 import re, time, types
 class Base:
@@ -67,7 +67,7 @@ module.buildDriver = Driver
 sys.modules[module.__name__] = module
 """
 
-#: A driver like that of macOS. It speaks on its own, reports words as names, and confirms a stop after some time.
+#: A driver like that of macOS. It plays the sound itself, names the words, and takes some time to confirm a stop.
 SLOW_DRIVER = _DRIVER.format(
     name="slow",
     driver="""
@@ -83,7 +83,7 @@ class Driver(Base):
 """,
 )
 
-#: A driver that takes 0.1 s for a word, reports each word, and writes each text to standard error.
+#: A driver that speaks a word in 0.1 s, reports it, and writes each text to standard error.
 TIMED_DRIVER = _DRIVER.format(
     name="timed",
     driver="""
@@ -97,7 +97,7 @@ class Driver(Base):
 """,
 )
 
-#: A system without libespeak-ng.
+#: Code that hides the system's libespeak-ng.
 NO_LIBRARY = """
 import ctypes
 class Missing(ctypes.CDLL):
@@ -110,28 +110,28 @@ ctypes.CDLL = Missing
 
 
 @pytest.fixture(scope="module")
-def shared() -> Iterator[Shared]:
-    with contextlib.closing(Shared(lambda: Spawned(driver="dummy"))) as shared:
+def shared() -> Iterator[SharedEngine]:
+    with contextlib.closing(SharedEngine(lambda: Engine(driver="dummy"))) as shared:
         yield shared
 
 
 def test_the_dummy_driver_lists_its_voices() -> None:
-    with Spawned(driver="dummy") as engine:
+    with Engine(driver="dummy") as engine:
         ready = engine.until(protocol.Ready)
         assert (ready.driver, ready.player) == ("dummy", None)
         assert engine.until(protocol.VoiceList).voices[0].id == "dummy.voice1"
 
 
 @pytest.mark.parametrize(("driver", "before"), [("dummy", ""), ("slow", SLOW_DRIVER)])
-def test_a_driver_is_stepped_to_the_end_of_each_sentence_and_reports_words(driver: str, before: str) -> None:
-    with Spawned(driver=driver, before=before) as engine:
+def test_a_driver_finishes_each_sentence_and_reports_its_words(driver: str, before: str) -> None:
+    with Engine(driver=driver, before=before) as engine:
         for goal in ("g1", "g2"):
             assert engine.spoken("battery low", goal).outcome == protocol.OUTCOME_COMPLETED
             assert [(word.start, word.end) for word in engine.words(goal)] == [(0, 7), (8, 11)]
 
 
 def test_a_driver_gets_a_text_in_markdown_without_its_marks() -> None:
-    with Spawned(driver="slow", before=SLOW_DRIVER) as engine:
+    with Engine(driver="slow", before=SLOW_DRIVER) as engine:
         engine.send(protocol.Speak("g1", "**battery** `low`", 200, 1.0, None, 50, format="markdown"))
         assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
         assert [(word.start, word.end) for word in engine.words()] == [(2, 9), (13, 16)]
@@ -150,8 +150,8 @@ def test_a_driver_gets_a_text_in_markdown_without_its_marks() -> None:
         ),
     ],
 )
-def test_an_option_that_the_driver_lacks_fails_the_goal(
-    engine: Spawned, more: dict[str, Any], reason: str, message: str
+def test_a_goal_fails_if_the_driver_lacks_one_of_its_options(
+    engine: Engine, more: dict[str, Any], reason: str, message: str
 ) -> None:
     ended = engine.spoken("yes", **more)
     assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, reason)
@@ -161,8 +161,8 @@ def test_an_option_that_the_driver_lacks_fails_the_goal(
 
 
 @limits()
-def test_a_stop_of_a_slow_driver_ends_when_it_says_so_and_an_error_of_it_fails_its_goal_alone() -> None:
-    with Spawned(driver="slow", before=SLOW_DRIVER) as engine:
+def test_a_slow_driver_confirms_a_stop_and_its_error_fails_only_one_goal() -> None:
+    with Engine(driver="slow", before=SLOW_DRIVER) as engine:
         engine.say("battery low")
         engine.until_word()
         assert_within(engine.stop(), 0.15, "the stop")
@@ -171,45 +171,45 @@ def test_a_stop_of_a_slow_driver_ends_when_it_says_so_and_an_error_of_it_fails_i
         assert engine.spoken("yes", "g3").outcome == protocol.OUTCOME_COMPLETED
 
 
-def _timed(text: str = "battery low, please come home") -> Spawned:
-    engine = Spawned(driver="timed", before=TIMED_DRIVER, alive_every=0.3)
+def _start_timed_driver(text: str = "battery low, please come home") -> Engine:
+    engine = Engine(driver="timed", before=TIMED_DRIVER, alive_every=0.3)
     engine.until(protocol.VoiceList)
     engine.say(text)
     return engine
 
 
-def _texts(engine: Spawned) -> list[str]:
-    """End the process, and return the texts that the driver got."""
+def _driver_texts(engine: Engine) -> list[str]:
+    """Wait for the end of the process, and return the texts that the driver got."""
     engine.leave()
     return engine.errors().splitlines()
 
 
-def test_a_driver_without_a_pause_goes_on_from_the_last_word_each_time() -> None:
-    with _timed() as engine:
+def test_a_driver_without_pauses_resumes_at_the_last_reported_word() -> None:
+    with _start_timed_driver() as engine:
         for number in (2, 4):
             engine.until_word(number)
-            assert engine.pause() >= 0.2, "it is silent only when the driver says so"
+            assert engine.pause() >= 0.2, "the pause was confirmed before the driver was silent"
             assert isinstance(engine.event(), protocol.Alive)
             engine.resume()
         assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
         assert [word.start for word in engine.words()] == [0, 8, 13, 20, 25]
         assert [word.number for word in engine.words()] == [1, 2, 3, 4, 5]
-        assert engine.words()[-1].time < 0.5 + 2 * (0.2 + 0.1 + 0.15), "the pauses do not count"
-        assert _texts(engine) == ["battery low, please come home", "low, please come home", "come home"]
+        assert engine.words()[-1].time < 0.5 + 2 * (0.2 + 0.1 + 0.15), "the word times include the pauses"
+        assert _driver_texts(engine) == ["battery low, please come home", "low, please come home", "come home"]
 
 
-def test_a_driver_that_has_not_said_a_word_says_all_of_it_after_a_pause() -> None:
-    with _timed() as engine:
+def test_a_driver_paused_before_the_first_word_speaks_the_whole_text() -> None:
+    with _start_timed_driver() as engine:
         engine.until(protocol.Started)
         engine.pause()
         engine.resume()
         assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
         assert len(engine.words()) == 5
-        assert set(_texts(engine)) == {"battery low, please come home"}
+        assert set(_driver_texts(engine)) == {"battery low, please come home"}
 
 
-def test_a_driver_that_is_resumed_before_it_is_silent_goes_on_when_it_is() -> None:
-    with _timed() as engine:
+def test_a_driver_resumed_before_it_is_silent_continues_once_it_is() -> None:
+    with _start_timed_driver() as engine:
         engine.until(protocol.Word)
         engine.send(protocol.Hold("g1", 1))
         engine.resume()
@@ -219,8 +219,8 @@ def test_a_driver_that_is_resumed_before_it_is_silent_goes_on_when_it_is() -> No
 
 
 @pytest.mark.parametrize("silent", [True, False])
-def test_a_stop_ends_a_driver_that_is_paused(silent: bool) -> None:
-    with _timed() as engine:
+def test_a_stop_ends_a_paused_driver(silent: bool) -> None:
+    with _start_timed_driver() as engine:
         engine.until(protocol.Word)
         if silent:
             engine.pause()
@@ -229,47 +229,47 @@ def test_a_stop_ends_a_driver_that_is_paused(silent: bool) -> None:
         engine.send(protocol.Stop("g1"))
         assert engine.until(protocol.Ended) == protocol.Ended("g1", protocol.OUTCOME_STOPPED)
         assert engine.spoken("yes", "g2").outcome == protocol.OUTCOME_COMPLETED
-        assert _texts(engine) == ["battery low, please come home", "yes"]
+        assert _driver_texts(engine) == ["battery low, please come home", "yes"]
 
 
 @limits()
-def test_a_driver_that_never_ends_shows_no_sign_of_life_after_a_while() -> None:
+def test_signs_of_life_stop_if_the_driver_never_finishes() -> None:
     patience = (
         "from talkcli.engine.child import runner\nrunner.DRIVER_LIMIT_S, runner.MAX_WORDS_PER_CHARACTER = 0.7, 0\n"
     )
     never = "Driver.stop = lambda self: None\nDriver.END = 1e9\n"
-    with Spawned(driver="slow", before=patience + SLOW_DRIVER + never) as engine:
+    with Engine(driver="slow", before=patience + SLOW_DRIVER + never) as engine:
         engine.until(protocol.VoiceList)
         engine.say("battery low")
         engine.until_word(2)
-        began = time.monotonic()
+        started_at = time.monotonic()
         alive = 0
         while select.select([engine._socket], [], [], 2 * protocol.ALIVE_INTERVAL_S + 0.2)[0]:
             assert isinstance(engine.event(), protocol.Alive)
-            assert_within(time.monotonic() - began, 0.7 + protocol.ALIVE_INTERVAL_S + 0.2, "the last sign of life")
+            elapsed = time.monotonic() - started_at
+            assert_within(elapsed, 0.7 + protocol.ALIVE_INTERVAL_S + 0.2, "the last sign of life")
             alive += 1
         assert alive == 1
-        assert _processor(engine.process.pid) < 0.5, "it spins"
+        assert _processor_seconds(engine.process.pid) < 0.5, "it waits busily"
         engine.process.kill()
         assert engine.errors() == "the driver did not finish a text that takes less than 1 s\n"
 
 
-def _processor(pid: int) -> float:
-    """Return the processor time that a process has used, in seconds."""
+def _processor_seconds(pid: int) -> float:
     with open(f"/proc/{pid}/stat", encoding="ascii", errors="replace") as file:
         fields = file.read().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def test_the_wheels_library_serves_if_the_system_has_none() -> None:
-    with Spawned(before=NO_LIBRARY) as engine:
+def test_the_library_from_the_wheel_is_used_if_the_system_has_none() -> None:
+    with Engine(before=NO_LIBRARY) as engine:
         version = engine.until(protocol.Ready).version
         assert version is not None
         assert version.endswith("(espeakng-loader)")
         assert engine.spoken("yes").outcome == protocol.OUTCOME_COMPLETED
 
 
-#: A library that lacks even the default voice.
+#: Code that makes even the default voice unavailable in libespeak-ng.
 WITHOUT_ENGLISH = """
 from talkcli.engine.child.synthesizers import espeak
 load_library = espeak.load_library
@@ -282,7 +282,7 @@ espeak.load_library = without_english
 
 
 @pytest.mark.parametrize(
-    ("options", "words", "more"),
+    ("options", "parts", "fields"),
     [
         (
             {"before": NO_LIBRARY + "sys.modules['espeakng_loader'] = None"},
@@ -322,20 +322,20 @@ espeak.load_library = without_english
         ),
     ],
 )
-def test_a_start_that_fails_says_what_to_install_or_to_change(
-    options: dict[str, Any], words: list[str], more: dict[str, Any]
+def test_a_failed_start_reports_what_to_install_or_change(
+    options: dict[str, Any], parts: list[str], fields: dict[str, Any]
 ) -> None:
-    with Spawned(**options) as engine:
+    with Engine(**options) as engine:
         failed = engine.until(protocol.StartFailed)
         assert engine.event() is None
         assert engine.process.wait(5) == 0
-    assert all(each in failed.message for each in words), failed
-    assert {name: getattr(failed, name) for name in more} == more
-    assert failed.reason == more.get("reason", "engine_failed")
+    assert all(part in failed.message for part in parts), failed
+    assert {name: getattr(failed, name) for name in fields} == fields
+    assert failed.reason == fields.get("reason", "engine_failed")
 
 
 def test_espeak_means_talks_own_driver() -> None:
-    with Spawned(driver="espeak") as engine:
+    with Engine(driver="espeak") as engine:
         assert engine.until(protocol.Ready).driver == "espeak"
         assert engine.spoken("yes").outcome == protocol.OUTCOME_COMPLETED
 
@@ -346,36 +346,34 @@ def test_espeak_means_talks_own_driver() -> None:
 _NAME = "talk_scripted"
 
 
-class Told:
-    """An engine of pyttsx3 with talk's own driver, which records all notifications.
-
-    It stands in for the runner.
-    """
+class Recorder:
+    """A pyttsx3 engine with talk's own driver. It replaces the runner, and records all notifications."""
 
     def __init__(self, player: str = "null", synthesizer: Synthesizer | None = None) -> None:
-        self.told: list[tuple[str, dict[str, Any]]] = []
+        self.notifications: list[tuple[str, dict[str, Any]]] = []
         self.position: float | None = None
         self.duration: float | None = None
-        self.beside: list[tuple[float | None, float | None]] = []
-        #: called for each word, and in each wait
+        #: the position and the duration at each notification
+        self.times: list[tuple[float | None, float | None]] = []
+        #: called for each word, and after each wait
         self.at_word: Callable[[], None] = lambda: None
         self.at_wait: Callable[[], None] = lambda: None
         self.players = PlayerChooser(protocol.Configure(0, None, player, None, None))
         self.hold_number = 0
         register_driver(_NAME, synthesizer or Scripted(), cast("GoalRunner", self))
-        self.engine: Any = Engine(_NAME)
+        self.engine: Any = pyttsx3.engine.Engine(_NAME)
         for topic in ("started-utterance", "started-word", "finished-utterance", "error"):
-            self.engine.connect(topic, self._note(topic))
+            self.engine.connect(topic, self._make_callback(topic))
         self.engine.startLoop(False)
 
-    def _note(self, topic: str) -> Callable[..., None]:
-        def note(**values: object) -> None:
-            self.told.append((topic, values))
-            self.beside.append((self.position, self.duration))
+    def _make_callback(self, topic: str) -> Callable[..., None]:
+        def record(**values: object) -> None:
+            self.notifications.append((topic, values))
+            self.times.append((self.position, self.duration))
             if topic == "started-word":
                 self.at_word()
 
-        return note
+        return record
 
     def wait(self, interests: Sequence[Interest], until: float | None) -> None:
         poll = select.poll()
@@ -384,118 +382,119 @@ class Told:
         poll.poll(None if until is None else max(0.0, until - time.monotonic()) * 1000)
         self.at_wait()
 
-    def report_voice(self, _voice: str, _why: str | None) -> None:
+    def report_voice(self, _voice: str, _fallback_reason: str | None) -> None:
         pass
 
     def spoken(self, text: str, name: str) -> list[tuple[str, dict[str, Any]]]:
         """Speak a text as the runner does, and return the notifications."""
-        self.told.clear()
-        self.beside.clear()
+        self.notifications.clear()
+        self.times.clear()
         self.engine.say(text, name)
-        while not any(topic == "finished-utterance" for topic, _ in self.told):
+        while not any(topic == "finished-utterance" for topic, _ in self.notifications):
             self.engine.iterate()
-        return self.told
+        return self.notifications
 
 
 @pytest.fixture
-def told() -> Told:
-    return Told()
+def recorder() -> Recorder:
+    return Recorder()
 
 
 def _word(name: str, location: int, length: int) -> tuple[str, dict[str, object]]:
     return ("started-word", {"name": name, "location": location, "length": length})
 
 
-def test_a_sentence_is_told_in_pyttsx3s_form_and_its_times_beside_that(told: Told) -> None:
-    assert told.spoken("ab c", "g1") == [
+def test_a_sentence_sends_pyttsx3s_notifications_and_sets_the_times(recorder: Recorder) -> None:
+    assert recorder.spoken("ab c", "g1") == [
         ("started-utterance", {"name": "g1"}),
         _word("g1", 0, 2),
         _word("g1", 3, 1),
         ("finished-utterance", {"name": "g1", "completed": True}),
     ]
-    assert [word for word, _ in told.beside[1:3]] == [0.0, 0.1]
-    assert told.beside[3][1] == pytest.approx(0.15)
-    assert told.spoken("a", "g2")[-1] == ("finished-utterance", {"name": "g2", "completed": True})
-    assert told.beside[-1][1] == pytest.approx(0.05)
+    assert [position for position, _ in recorder.times[1:3]] == [0.0, 0.1]
+    assert recorder.times[3][1] == pytest.approx(0.15)
+    assert recorder.spoken("a", "g2")[-1] == ("finished-utterance", {"name": "g2", "completed": True})
+    assert recorder.times[-1][1] == pytest.approx(0.05)
 
 
-def test_a_sentence_that_is_stopped_is_not_completed_and_has_no_duration(told: Told) -> None:
-    told.spoken("a", "g1")
-    told.at_word = told.engine.stop
-    assert told.spoken("abcdefgh i", "g2") == [
+def test_a_stopped_sentence_is_not_completed_and_has_no_duration(recorder: Recorder) -> None:
+    recorder.spoken("a", "g1")
+    recorder.at_word = recorder.engine.stop
+    assert recorder.spoken("abcdefgh i", "g2") == [
         ("started-utterance", {"name": "g2"}),
         _word("g2", 0, 8),
         ("finished-utterance", {"name": "g2", "completed": False}),
     ]
-    assert told.beside[-1][1] is None
+    assert recorder.times[-1][1] is None
 
 
-def test_an_error_is_told_before_the_end() -> None:
-    told = Told("no-such-player-anywhere")
-    started, (topic, values), finished = told.spoken("a", "g1")
+def test_an_error_is_reported_before_the_end_of_the_sentence() -> None:
+    recorder = Recorder("no-such-player-anywhere")
+    started, (topic, values), finished = recorder.spoken("a", "g1")
     assert started == ("started-utterance", {"name": "g1"})
     assert (topic, {*values}, values["name"]) == ("error", {"name", "exception"}, "g1")
     assert isinstance(values["exception"], CannotSpeak)
     assert finished == ("finished-utterance", {"name": "g1", "completed": False})
-    assert told.beside[-1][1] is None
+    assert recorder.times[-1][1] is None
 
 
-def test_its_properties_are_pyttsx3s_and_pitch(told: Told) -> None:
-    engine = told.engine
+def test_the_properties_are_those_of_pyttsx3_and_pitch(recorder: Recorder) -> None:
+    engine = recorder.engine
     engine.iterate()
-    assert [(each.id, each.name, each.languages) for each in engine.getProperty("voices")] == [
+    assert [(voice.id, voice.name, voice.languages) for voice in engine.getProperty("voices")] == [
         ("one", "One", ["en"]),
         ("two", "Two", []),
     ]
     names = ("voice", "rate", "volume", "pitch")
-    assert [engine.getProperty(each) for each in names] == ["one", 200, 1.0, 50]
+    assert [engine.getProperty(name) for name in names] == ["one", 200, 1.0, 50]
     for name, value in zip(names, ("two", 300, 0.5, 60), strict=True):
         engine.setProperty(name, value)
-    assert [engine.getProperty(each) for each in names] == ["two", 300, 0.5, 60]
-    assert told.told == []
-    told.spoken("ab", "g1")
-    assert told.beside[-1][1] == pytest.approx(0.1 * 200 / 300, rel=0.01)
+    assert [engine.getProperty(name) for name in names] == ["two", 300, 0.5, 60]
+    assert recorder.notifications == []
+    recorder.spoken("ab", "g1")
+    assert recorder.times[-1][1] == pytest.approx(0.1 * 200 / 300, rel=0.01)
 
 
 @pytest.mark.parametrize(
     ("name", "value", "kind"), [("speed", 3, KeyError), ("voice", "three", UnknownVoice), ("rate", "fast", ValueError)]
 )
-def test_a_wrong_property_is_an_error(told: Told, name: str, value: object, kind: type[Exception]) -> None:
-    """It doesn't change any property."""
-    told.engine.iterate()
-    told.engine.setProperty(name, value)
-    ((topic, values),) = told.told
+def test_an_invalid_property_is_an_error_and_changes_nothing(
+    recorder: Recorder, name: str, value: object, kind: type[Exception]
+) -> None:
+    recorder.engine.iterate()
+    recorder.engine.setProperty(name, value)
+    ((topic, values),) = recorder.notifications
     assert (topic, {*values}) == ("error", {"name", "exception"})
     assert type(values["exception"]) is kind
-    assert [told.engine.getProperty(each) for each in ("voice", "rate")] == ["one", 200]
+    assert [recorder.engine.getProperty(name) for name in ("voice", "rate")] == ["one", 200]
 
 
 class Thinking(Scripted):
-    """A synthesizer that writes a few samples and then computes for a long time."""
+    """A synthesizer that writes a few samples, and then computes for a long time."""
 
     def speak(self, text: str, sound: SpeechSettings, output: SampleSink) -> None:  # noqa: ARG002 - no text is spoken
         output.begin(self._RATE, "scripted")
-        tone = array("h", [9000 if each % 100 < 50 else -9000 for each in range(self._RATE // 5)]).tobytes()
+        tone = array("h", [9000 if index % 100 < 50 else -9000 for index in range(self._RATE // 5)]).tobytes()
         output.word(0, 1, 0.0)
-        output.word(2, 1, 0.16)  # all samples were accepted, but not heard
+        output.word(2, 1, 0.16)  # heard after all samples have been accepted
         output.write(tone)
         for _ in range(200):
             output.write(b"")
-            time.sleep(0.005)  # the computation
+            time.sleep(0.005)  # as if it computed
 
 
 @limits()
-def test_words_are_told_as_they_are_heard_while_the_rest_is_computed_and_a_stop_comes_in() -> None:
-    told, at = Told(synthesizer=Thinking()), list[float]()
+def test_words_are_reported_and_a_stop_works_during_a_long_computation() -> None:
+    recorder, word_times = Recorder(synthesizer=Thinking()), list[float]()
 
-    def hear() -> None:
-        at.append(time.monotonic() - began)
-        if len(at) == 2:
-            told.at_wait = told.engine.stop
+    def record_word() -> None:
+        word_times.append(time.monotonic() - started_at)
+        if len(word_times) == 2:
+            recorder.at_wait = recorder.engine.stop
 
-    told.at_word = hear
-    began = time.monotonic()
-    assert told.spoken("a b c", "g1")[-1] == ("finished-utterance", {"name": "g1", "completed": False})
-    assert len(at) == 2
-    assert at[1] >= 0.15
-    assert_within(at[1], 0.3, "the word before the gap")
+    recorder.at_word = record_word
+    started_at = time.monotonic()
+    assert recorder.spoken("a b c", "g1")[-1] == ("finished-utterance", {"name": "g1", "completed": False})
+    assert len(word_times) == 2
+    assert word_times[1] >= 0.15
+    assert_within(word_times[1], 0.3, "the word before the gap")

@@ -1,4 +1,4 @@
-"""Texts that grow while an engine process speaks them: they sound and report their words as if they came at once."""
+"""Texts that grow while an engine process speaks them. They sound like whole texts, and report the same words."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from talkcli.engine import protocol
 from talkcli.goals.reasons import Reason
-from tests.engine.spawned import Shared, Spawned
+from tests.engine.process import Engine, SharedEngine
 from tests.support.compare import assert_heard
 from tests.support.reference import Sentence, render
 from tests.support.timing import assert_within, limits
@@ -27,7 +27,7 @@ TEXT = "I found the charger. It is near the door, behind the table. Shall I go t
 RATE = 450
 
 
-def grow(engine: Spawned, text: str, goal: str = "g1", *, interval_s: float = 0.0, end: bool = True) -> None:
+def grow(engine: Engine, text: str, goal: str = "g1", *, interval_s: float = 0.0, end: bool = True) -> None:
     """Send a text in tokens of four characters."""
     tokens = [text[at : at + 4] for at in range(0, len(text), 4)]
     engine.send(protocol.Speak(goal, tokens[0], RATE, 1.0, None, 50, more=True))
@@ -39,18 +39,18 @@ def grow(engine: Spawned, text: str, goal: str = "g1", *, interval_s: float = 0.
 
 
 @pytest.fixture(scope="module")
-def shared() -> Iterator[Shared]:
-    with contextlib.closing(Shared(Spawned)) as shared:
+def shared() -> Iterator[SharedEngine]:
+    with contextlib.closing(SharedEngine(Engine)) as shared:
         yield shared
 
 
 @pytest.fixture
-def engine(shared: Shared, request: pytest.FixtureRequest) -> Spawned:
+def engine(shared: SharedEngine, request: pytest.FixtureRequest) -> Engine:
     return shared.take(request.session.testsfailed)
 
 
 def test_a_growing_text_is_heard_like_a_whole_one(sink: Sink) -> None:
-    with Spawned("pulse", environment=sink.env) as engine, sink.record() as recording:
+    with Engine("pulse", environment=sink.env) as engine, sink.record() as recording:
         grow(engine, TEXT, interval_s=0.02)
         ended = engine.until(protocol.Ended)
         recording.wait_until_quiet(0.3)
@@ -60,8 +60,8 @@ def test_a_growing_text_is_heard_like_a_whole_one(sink: Sink) -> None:
 
 def test_a_file_gets_the_same_samples(tmp_path: Path) -> None:
     lengths = []
-    for name, send in (("whole", Spawned.say), ("grown", grow)):
-        with Spawned(f"file:{tmp_path / name}") as engine:
+    for name, send in (("whole", Engine.say), ("grown", grow)):
+        with Engine(f"file:{tmp_path / name}") as engine:
             send(engine, TEXT)
             assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
         with wave.open(str(tmp_path / name)) as file:
@@ -70,7 +70,7 @@ def test_a_file_gets_the_same_samples(tmp_path: Path) -> None:
     assert lengths[0] == pytest.approx(lengths[1], abs=22050 * 0.03)
 
 
-def test_words_have_their_places_in_the_whole_text(engine: Spawned) -> None:
+def test_words_have_their_places_in_the_whole_text(engine: Engine) -> None:
     whole = engine.spoken(TEXT)
     words = [(word.start, word.end, word.number) for word in engine.words()]
     grow(engine, TEXT, "g2")
@@ -80,7 +80,7 @@ def test_words_have_their_places_in_the_whole_text(engine: Spawned) -> None:
     assert ended.duration == pytest.approx(whole.duration, abs=0.03)
 
 
-def test_missing_text_is_reported_once_and_so_is_its_end(engine: Spawned) -> None:
+def test_missing_text_is_reported_once_and_so_is_its_end(engine: Engine) -> None:
     grow(engine, "One. ", end=False)
     missing = [engine.until(protocol.TextMissing).missing]  # nothing can be spoken yet
     missing += [engine.until(protocol.TextMissing).missing for _ in range(2)]
@@ -93,19 +93,19 @@ def test_missing_text_is_reported_once_and_so_is_its_end(engine: Spawned) -> Non
 
 def test_missing_text_is_reported_if_the_silence_at_the_end_is_held_back(sink: Sink) -> None:
     before = "from talkcli.engine.child.players import chooser; chooser.HandoverTimes.silence_to_cut = lambda *_: 1.0"
-    with Spawned("aplay", environment=sink.env, before=before) as engine:
+    with Engine("aplay", environment=sink.env, before=before) as engine:
         grow(engine, "One. ", end=False)
         assert [engine.until(protocol.TextMissing).missing for _ in range(3)] == [True, False, True]
 
 
-def test_the_end_of_a_text_may_come_after_all_of_it_was_heard(engine: Spawned) -> None:
+def test_the_end_of_a_text_may_come_after_all_of_it_was_heard(engine: Engine) -> None:
     grow(engine, "One.", end=False)
     assert [engine.until(protocol.TextMissing).missing for _ in range(3)] == [True, False, True]
     engine.send(protocol.Append("g1", " ", end=True))
     assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
 
 
-def test_a_goal_that_waits_for_text_can_be_stopped_and_paused(engine: Spawned) -> None:
+def test_a_goal_that_waits_for_text_can_be_stopped_and_paused(engine: Engine) -> None:
     with limits():
         for goal in ("g1", "g2"):
             grow(engine, "One.", goal, end=False)
@@ -120,7 +120,7 @@ def test_a_goal_that_waits_for_text_can_be_stopped_and_paused(engine: Spawned) -
 
 
 @pytest.mark.parametrize("whole", [False, True], ids=["appended", "sent again"])
-def test_an_incomplete_sentence_at_the_end_of_a_broken_text_is_not_spoken(engine: Spawned, whole: bool) -> None:
+def test_an_incomplete_sentence_at_the_end_of_a_broken_text_is_not_spoken(engine: Engine, whole: bool) -> None:
     text = "One two. Three fo"
     if whole:
         engine.send(protocol.Speak("g1", text, RATE, 1.0, None, 50, broken=True))
@@ -131,7 +131,7 @@ def test_an_incomplete_sentence_at_the_end_of_a_broken_text_is_not_spoken(engine
     assert [text[word.start : word.end] for word in engine.words()] == ["One", "two"]
 
 
-def test_text_for_a_goal_that_has_ended_is_ignored(engine: Spawned) -> None:
+def test_text_for_a_goal_that_has_ended_is_ignored(engine: Engine) -> None:
     grow(engine, "One.")
     engine.until(protocol.Ended)
     engine.send(protocol.Append("g1", " Two.", end=True))
@@ -139,14 +139,14 @@ def test_text_for_a_goal_that_has_ended_is_ignored(engine: Spawned) -> None:
     assert len(engine.words("g1")) == len(engine.words("g2")) == 1
 
 
-def test_a_text_without_speech_can_not_be_spoken(engine: Spawned) -> None:
+def test_a_text_without_speech_can_not_be_spoken(engine: Engine) -> None:
     grow(engine, "... ... ...")
     ended = engine.until(protocol.Ended)
     assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, Reason.NOTHING_TO_SAY)
 
 
 def test_another_driver_refuses_a_growing_text() -> None:
-    with Spawned(driver="dummy") as engine:
+    with Engine(driver="dummy") as engine:
         grow(engine, "One. Two.")
         ended = engine.until(protocol.Ended)
         assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, Reason.BAD_OPTION)

@@ -1,6 +1,6 @@
-"""A neural voice in the engine process: it speaks, is stopped and held at any time, and tells its faults.
+"""Tests for neural voices in the engine process: speech, stops, pauses, loading, and reported faults.
 
-Tests that leave the process as it is share one, which writes to a file and so takes no time.
+Tests that don't change the process share one. It writes to a file, which is faster than real time.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ import pytest
 from talkcli import install
 from talkcli.engine import protocol
 from talkcli.install import NEURAL_PACKAGES
+from tests.engine.process import SOON, Engine, SharedEngine, before_call
 from tests.engine.programs import Player, without_silence
-from tests.engine.spawned import SOON, Shared, Spawned, first
 from tests.support import tiny_voice
 from tests.support.espeak import RATE
 from tests.support.processes import children
@@ -39,11 +39,11 @@ if TYPE_CHECKING:
 
 TEXT = "battery low, please come home"
 VOICE = "piper/tiny"
-#: Code that runs in the process first and makes loading slow, as on a slow machine.
-SLOW_TO_LOAD = first("synthesizers.inference:Model._set_halves", "time.sleep(0.8)")
-#: … that makes all but the first sound of a sentence too late.
-SLOW_TO_SPEAK = first("synthesizers.inference:Model.decode", "time.sleep(0.8 if arguments[2] else 0)")
-#: … that hides packages.
+#: Code for the start of the process that makes loading slow, as on a slow machine.
+SLOW_TO_LOAD = before_call("synthesizers.inference:Model._set_halves", "time.sleep(0.8)")
+#: Code that makes all samples of a sentence late, except the first piece.
+SLOW_TO_SPEAK = before_call("synthesizers.inference:Model.decode", "time.sleep(0.8 if arguments[2] else 0)")
+#: Code that hides packages.
 WITHOUT = """
 import sys, importlib.abc
 class Without(importlib.abc.MetaPathFinder):
@@ -55,17 +55,17 @@ find_spec = importlib.util.find_spec
 importlib.util.find_spec = lambda name, *rest: None if name in {names} else find_spec(name, *rest)
 sys.meta_path.insert(0, Without())
 """
-#: Modules that an engine process without a neural voice has no use for.
+#: Modules that an engine process doesn't need if no neural voice speaks.
 NEURAL_MODULES = [
     *NEURAL_PACKAGES,
     *("difflib", "hashlib", "queue"),
-    *(f"talkcli.engine.child.synthesizers.{each}" for each in ("inference", "loader", "phonemes", "piper", "vits")),
+    *(f"talkcli.engine.child.synthesizers.{name}" for name in ("inference", "loader", "phonemes", "piper", "vits")),
 ]
 
 
 @pytest.fixture(scope="module")
 def voices(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a directory with a voice that hums, in some milliseconds."""
+    """Return a directory with a tiny voice, which hums and is loaded in some milliseconds."""
     needs_packages(*NEURAL_PACKAGES)
     path = tmp_path_factory.mktemp("neural") / "voices"
     tiny_voice.put(path, "tiny")
@@ -73,55 +73,60 @@ def voices(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def place(voices: Path) -> Iterator[Path]:
-    """That directory. The voices that a test puts there are removed after it."""
+def folder(voices: Path) -> Iterator[Path]:
+    """Return the directory of the tiny voice. Voices that the test adds to it are removed after the test."""
     yield voices
-    for each in voices.iterdir():
-        if not each.name.startswith("tiny."):
-            each.unlink()
+    for path in voices.iterdir():
+        if not path.name.startswith("tiny."):
+            path.unlink()
 
 
 @pytest.fixture(scope="module")
-def shared(voices: Path) -> Iterator[Shared]:
-    with contextlib.closing(Shared(lambda: _engine(voices, f"file:{voices.parent / 'out.wav'}"))) as shared:
+def shared(voices: Path) -> Iterator[SharedEngine]:
+    with contextlib.closing(SharedEngine(lambda: _engine(voices, f"file:{voices.parent / 'out.wav'}"))) as shared:
         yield shared
 
 
-def _engine(place: Path, player: str = "null", sink: Mapping[str, str] | None = None, **more: Any) -> Spawned:
-    places = {"TALK_VOICES": str(place), "XDG_CACHE_HOME": str(place.parent / "cache")}
-    return Spawned(player, environment={**places, **(sink or {})}, **more)
+def _engine(folder: Path, player: str = "null", sink: Mapping[str, str] | None = None, **more: Any) -> Engine:
+    folders = {"TALK_VOICES": str(folder), "XDG_CACHE_HOME": str(folder.parent / "cache")}
+    return Engine(player, environment={**folders, **(sink or {})}, **more)
 
 
-def _failed(ended: protocol.Ended, reason: str = "voice_failed") -> str:
+def _failure_message(ended: protocol.Ended, reason: str = "voice_failed") -> str:
     assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, reason), ended
     return ended.message or ""
 
 
-def _loaded(engine: Spawned) -> list[protocol.VoiceLoaded]:
-    return [each for each in engine.events if isinstance(each, protocol.VoiceLoaded)]
+def _loaded(engine: Engine) -> list[protocol.VoiceLoaded]:
+    return [event for event in engine.events if isinstance(event, protocol.VoiceLoaded)]
 
 
-def _speaks(engine: Spawned, goal: str) -> list[tuple[str, str | None]]:
+def _chosen_voices(engine: Engine, goal: str) -> list[tuple[str, str | None]]:
+    """Return the voices chosen for a goal, with the reasons for a fallback."""
     return [
-        (each.voice, each.fallback_reason)
-        for each in engine.events
-        if isinstance(each, protocol.VoiceChosen) and each.id == goal
+        (event.voice, event.fallback_reason)
+        for event in engine.events
+        if isinstance(event, protocol.VoiceChosen) and event.id == goal
     ]
 
 
-def test_a_neural_voice_speaks_with_its_words_and_espeak_before_and_after(engine: Spawned) -> None:
+def _words(engine: Engine, text: str, goal: str = "g1") -> list[str]:
+    """Return the reported words of a text."""
+    return [text[word.start : word.end] for word in engine.words(goal)]
+
+
+def test_neural_voices_and_espeak_take_turns_and_report_all_words(engine: Engine) -> None:
     for number, voice in enumerate([None, VOICE, "en-us", VOICE[:8], None]):
         ended = engine.spoken(TEXT, f"g{number}", voice=voice)
         assert ended.outcome == protocol.OUTCOME_COMPLETED, ended
-        words = [TEXT[each.start : each.end] for each in engine.words(f"g{number}")]
-        assert words == ["battery", "low", "please", "come", "home"]
+        assert _words(engine, TEXT, f"g{number}") == ["battery", "low", "please", "come", "home"]
 
 
 @pytest.mark.parametrize("rate", [8000, 48000])
-def test_any_rate_of_samples_goes_into_a_file(place: Path, tmp_path: Path, rate: int) -> None:
-    tiny_voice.put(place, "other", config=tiny_voice.description(rate=rate))
+def test_a_file_gets_the_sample_rate_of_the_voice(folder: Path, tmp_path: Path, rate: int) -> None:
+    tiny_voice.put(folder, "other", config=tiny_voice.description(rate=rate))
     target = tmp_path / "out.wav"
-    with _engine(place, f"file:{target}") as engine:
+    with _engine(folder, f"file:{target}") as engine:
         ended = engine.spoken(TEXT, voice="piper/other")
     assert ended.outcome == protocol.OUTCOME_COMPLETED
     with wave.open(str(target)) as file:
@@ -129,78 +134,77 @@ def test_any_rate_of_samples_goes_into_a_file(place: Path, tmp_path: Path, rate:
         assert file.getnframes() / rate == pytest.approx(ended.duration, abs=0.01)
 
 
-def test_a_speaker_is_named_behind_the_voice(place: Path, engine: Spawned) -> None:
-    tiny_voice.put(place, "many", tiny_voice.model(speakers=3), tiny_voice.description(speakers=3))
+def test_a_speaker_is_given_after_the_name_of_the_voice(folder: Path, engine: Engine) -> None:
+    tiny_voice.put(folder, "many", tiny_voice.model(speakers=3), tiny_voice.description(speakers=3))
     for number, voice in enumerate(["piper/many", "piper/many#2", "piper/many#p1"]):
         assert engine.spoken("a", f"g{number}", voice=voice).outcome == protocol.OUTCOME_COMPLETED
-    message = _failed(engine.spoken("a", "g8", voice="piper/many#3"), "unknown_voice")
+    message = _failure_message(engine.spoken("a", "g8", voice="piper/many#3"), "unknown_voice")
     assert 'no speaker "3"; the voice has 3 speakers, 0 to 2' in message
-    message = _failed(engine.spoken("a", "g9", voice=f"{VOICE}#1"), "unknown_voice")
+    message = _failure_message(engine.spoken("a", "g9", voice=f"{VOICE}#1"), "unknown_voice")
     assert 'no speaker "1"; the voice has one speaker' in message
 
 
-def test_a_voice_that_is_put_there_while_it_runs_is_found(place: Path, engine: Spawned) -> None:
-    message = _failed(engine.spoken("a", "g1", voice="piper/late"), "unknown_voice")
+def test_a_voice_installed_while_the_engine_runs_is_found(folder: Path, engine: Engine) -> None:
+    message = _failure_message(engine.spoken("a", "g1", voice="piper/late"), "unknown_voice")
     assert 'unknown voice "piper/late"' in message
-    tiny_voice.put(place, "late")
+    tiny_voice.put(folder, "late")
     assert engine.spoken("a", "g2", voice="piper/late").outcome == protocol.OUTCOME_COMPLETED
 
 
-def test_a_name_is_no_path(place: Path, engine: Spawned) -> None:
-    tiny_voice.put(place, ".tiny")
-    tiny_voice.put(place, "another")  # so that no voice is the only one whose name begins with nothing
+def test_the_name_of_a_voice_cannot_be_a_path(folder: Path, engine: Engine) -> None:
+    tiny_voice.put(folder, ".tiny")
+    tiny_voice.put(folder, "another")  # so that the empty name is ambiguous
     for name in ("../voices/tiny", "/tiny", ".tiny", "tiny/../tiny", ""):
-        _failed(engine.spoken("a", name, voice=f"piper/{name}"), "unknown_voice")
+        _failure_message(engine.spoken("a", name, voice=f"piper/{name}"), "unknown_voice")
 
 
-def test_the_json_of_a_voice_is_read_again_with_each_load(place: Path, engine: Spawned) -> None:
-    """It is no secret kept by the process: a voice that is dropped is another when it is loaded again."""
-    tiny_voice.put(place, "changes")
+def test_the_json_of_a_voice_is_read_whenever_the_voice_is_loaded(folder: Path, engine: Engine) -> None:
+    tiny_voice.put(folder, "changes")
     assert engine.spoken("a", "g1", voice="piper/changes").outcome == protocol.OUTCOME_COMPLETED
-    (place / "changes.onnx.json").write_text(json.dumps({"audio": {}}))
+    (folder / "changes.onnx.json").write_text(json.dumps({"audio": {}}))
     assert engine.spoken("a", "g2", voice="piper/changes").outcome == protocol.OUTCOME_COMPLETED
     engine.send(protocol.DropVoice("piper/changes"))
-    assert "does not describe a Piper voice" in _failed(engine.spoken("a", "g3", voice="piper/changes"))
+    assert "does not describe a Piper voice" in _failure_message(engine.spoken("a", "g3", voice="piper/changes"))
 
 
-def test_unknown_sounds_are_left_out_and_a_text_of_nothing_else_fails(place: Path, engine: Spawned) -> None:
-    """Several in a row: the thread that makes sound is handed the next piece for each of them."""
-    about = tiny_voice.description()
-    about["phoneme_id_map"] = {"_": [0], "^": [1], "$": [2], "a": [3], "\u00e6": [4]}
-    tiny_voice.put(place, "few", config=about)
+def test_unknown_phonemes_are_left_out_and_a_text_without_others_fails(folder: Path, engine: Engine) -> None:
+    """Many silent sentences in a row check that the inference thread gets the next piece after each of them."""
+    description = tiny_voice.description()
+    description["phoneme_id_map"] = {"_": [0], "^": [1], "$": [2], "a": [3], "\u00e6": [4]}
+    tiny_voice.put(folder, "few", config=description)
     text = "Cat! " + "See! " * 12 + "Cat!"
     assert engine.spoken(text, "g1", voice="piper/few").outcome == protocol.OUTCOME_COMPLETED
-    # It lacks the first sound of "cat", and all of "see". A sentence of which a part is heard tells all of its words.
-    assert [text[each.start : each.end] for each in engine.words("g1")] == ["Cat", "Cat"]
+    # The voice lacks the first phoneme of "cat" and all of "see". All words of a partly heard sentence are reported.
+    assert _words(engine, text) == ["Cat", "Cat"]
     assert engine.spoken("See a cat see.", "g3", voice="piper/few").outcome == protocol.OUTCOME_COMPLETED
-    told = [each.time for each in engine.words("g3")]
-    assert len(told) == 4
-    assert told == sorted(told)
-    message = _failed(engine.spoken("See! " * 12, "g2", voice="piper/few"))
+    times = [word.time for word in engine.words("g3")]
+    assert len(times) == 4
+    assert times == sorted(times)
+    message = _failure_message(engine.spoken("See! " * 12, "g2", voice="piper/few"))
     assert "few.onnx.json has no id for a phoneme of the text (" in message
 
 
 # -- without the extra
 
 
-def test_an_engine_process_that_speaks_as_ever_loads_nothing_of_it(place: Path) -> None:
+def test_without_neural_speech_no_neural_module_is_imported(folder: Path) -> None:
     report = f"""
 import atexit, sys
-atexit.register(lambda: sys.stderr.write(repr([each for each in {NEURAL_MODULES!r} if each in sys.modules])))
+atexit.register(lambda: sys.stderr.write(repr([name for name in {NEURAL_MODULES!r} if name in sys.modules])))
 """
-    with _engine(place, before=report) as engine:
-        assert VOICE in {each.id for each in engine.until(protocol.VoiceList).voices}
+    with _engine(folder, before=report) as engine:
+        assert VOICE in {voice.id for voice in engine.until(protocol.VoiceList).voices}
         assert engine.spoken("yes").outcome == protocol.OUTCOME_COMPLETED
         engine.leave()
         assert engine.errors() == "[]"
 
 
 @pytest.mark.parametrize("package", NEURAL_PACKAGES)
-def test_without_the_extra_a_voice_says_what_to_install(tmp_path: Path, package: str) -> None:
+def test_the_error_without_the_extra_contains_the_install_command(tmp_path: Path, package: str) -> None:
     tiny_voice.put(tmp_path / "voices", "tiny")
     before = WITHOUT.format(names=[package])
     with _engine(tmp_path / "voices", before=before) as engine:
-        message = _failed(engine.spoken(TEXT, voice=VOICE), "unknown_voice")
+        message = _failure_message(engine.spoken(TEXT, voice=VOICE), "unknown_voice")
         assert f"{VOICE} cannot be loaded" in message
         assert install.neural() in message
         assert engine.spoken("yes", "g2").outcome == protocol.OUTCOME_COMPLETED
@@ -213,12 +217,12 @@ def test_without_the_extra_a_voice_says_what_to_install(tmp_path: Path, package:
 # -- faults
 
 
-#: Faults of a voice's files: the model, the entries of its JSON, and the words of the error. Models that are refused
-#: when they are loaded are in `test_inference.py`.
+#: Faults in a voice's files: the model, the entries of its JSON, and a part of the error message. `test_inference.py`
+#: tests models that can't be loaded.
 WRONG: dict[str, tuple[bytes, dict[str, Any], str]] = {
     "no json": (tiny_voice.model(), {}, "wrong.onnx.json does not exist; download it from the source of the model"),
     "truncated": (tiny_voice.model()[:-300], {}, "is truncated, or not an ONNX model; download the voice again"),
-    "silent": (tiny_voice.model(amplitude=0.0), {}, "made no sound from a text; download the voice again"),
+    "silent": (tiny_voice.model(amplitude=0.0), {}, "produced no sound for a text; download the voice again"),
     "unknown language": (
         tiny_voice.model(),
         {"voice": "tlh"},
@@ -232,73 +236,71 @@ WRONG: dict[str, tuple[bytes, dict[str, Any], str]] = {
 }
 
 
-def _put_wrong(place: Path, wrong: str) -> str:
-    """Put the files there and return the words of the error."""
-    model, beside, words = WRONG[wrong]
-    path = tiny_voice.put(place, "wrong", model, tiny_voice.description(**beside))
+def _create_wrong_voice(folder: Path, wrong: str) -> str:
+    """Create the faulty files, and return a part of the error message."""
+    model, entries, message = WRONG[wrong]
+    path = tiny_voice.put(folder, "wrong", model, tiny_voice.description(**entries))
     if wrong == "no json":
-        (place / "wrong.onnx.json").unlink()
+        (folder / "wrong.onnx.json").unlink()
     elif wrong == "writable":
         path.chmod(0o666)
-    return words
+    return message
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_a_fault_of_a_voices_files_ends_one_goal_in_words(place: Path, engine: Spawned, wrong: str) -> None:
-    """And it is no reason to be silent for ever: the process lives, and a file that is mended is taken at once."""
+def test_faulty_voice_files_fail_a_goal_with_a_readable_message(folder: Path, engine: Engine, wrong: str) -> None:
+    """The process survives, and uses a repaired file at once."""
     engine.send(protocol.DropVoice("piper/wrong"))
-    words = _put_wrong(place, wrong)
-    message = _failed(engine.spoken(TEXT, "g1", voice="piper/wrong"))
-    assert words in message
-    assert str(place / "wrong.onnx") in message
+    expected = _create_wrong_voice(folder, wrong)
+    message = _failure_message(engine.spoken(TEXT, "g1", voice="piper/wrong"))
+    assert expected in message
+    assert str(folder / "wrong.onnx") in message
     assert engine.spoken(TEXT, "g2").outcome == protocol.OUTCOME_COMPLETED
-    assert words in _failed(engine.spoken(TEXT, "g3", voice="piper/wrong"))
-    tiny_voice.put(place, "wrong")
+    assert expected in _failure_message(engine.spoken(TEXT, "g3", voice="piper/wrong"))
+    tiny_voice.put(folder, "wrong")
     assert engine.spoken(TEXT, "g4", voice="piper/wrong").outcome == protocol.OUTCOME_COMPLETED
 
 
-@pytest.mark.parametrize(("wrong", "instead"), [("silent", "gmw/en-US"), ("unknown language", "gmw/en")])
-def test_a_voice_that_fails_at_once_is_no_reason_for_silence(
-    place: Path, engine: Spawned, wrong: str, instead: str
-) -> None:
-    """Nor is it given up for that: the next text may be another."""
+@pytest.mark.parametrize(("wrong", "fallback"), [("silent", "gmw/en-US"), ("unknown language", "gmw/en")])
+def test_espeak_speaks_if_a_neural_voice_fails_at_once(folder: Path, engine: Engine, wrong: str, fallback: str) -> None:
+    """The voice is tried again for the next text, which may work."""
     engine.send(protocol.DropVoice("piper/wrong"))
-    _put_wrong(place, wrong)
+    _create_wrong_voice(folder, wrong)
     engine.send(protocol.LoadVoice("piper/wrong"))
     assert engine.until(protocol.VoiceLoaded).error is None
     for goal in ("g1", "g2"):
         assert engine.spoken(TEXT, goal, voice="piper/wrong", voice_only=False).outcome == protocol.OUTCOME_COMPLETED
-        (first, why), (second, words) = _speaks(engine, goal)
-        assert (first, why, second) == ("piper/wrong", None, instead)
-        assert words is not None
-        assert str(place / "wrong.onnx") in words
-        assert [TEXT[each.start : each.end] for each in engine.words(goal)] == TEXT.replace(",", "").split()
+        (first, no_reason), (second, reason) = _chosen_voices(engine, goal)
+        assert (first, no_reason, second) == ("piper/wrong", None, fallback)
+        assert reason is not None
+        assert str(folder / "wrong.onnx") in reason
+        assert _words(engine, TEXT, goal) == TEXT.replace(",", "").split()
 
 
-def test_a_machine_without_memory_for_a_model_says_so_and_speaks_on(real: dict[str, str], tmp_path: Path) -> None:
-    """With espeak at once, and with the voice when there is memory again. The cached halves stay."""
+def test_speech_continues_if_there_is_no_memory_for_a_model(real_voice_env: dict[str, str], tmp_path: Path) -> None:
+    """Espeak can speak at once, and the voice as soon as there is memory again. The cached halves are kept."""
     target = f"file:{tmp_path / 'out.wav'}"
-    with Spawned(target, environment=real) as engine:
+    with Engine(target, environment=real_voice_env) as engine:
         assert engine.spoken("a", "g0", voice=REAL_VOICE).outcome == protocol.OUTCOME_COMPLETED
-        kept = _kept(real)
-    with Spawned(target, environment=real) as engine:
+        cached = _cached_halves(real_voice_env)
+    with Engine(target, environment=real_voice_env) as engine:
         with _little_memory(engine, 280 << 20):
-            message = _failed(engine.spoken(TEXT, "g1", voice=REAL_VOICE))
+            message = _failure_message(engine.spoken(TEXT, "g1", voice=REAL_VOICE))
             assert "there is not enough memory; end another program" in message
             assert "en_US-joe-medium.onnx" in message
             assert engine.spoken("yes", "g2").outcome == protocol.OUTCOME_COMPLETED
         assert engine.spoken("a", "g3", voice=REAL_VOICE).outcome == protocol.OUTCOME_COMPLETED
-    assert kept == _kept(real)
+    assert cached == _cached_halves(real_voice_env)
 
 
-def _kept(real: dict[str, str]) -> list[tuple[str, int]]:
-    return sorted((each.name, each.stat().st_ino) for each in Path(real["XDG_CACHE_HOME"], "talk").iterdir())
+def _cached_halves(real_voice_env: dict[str, str]) -> list[tuple[str, int]]:
+    return sorted((path.name, path.stat().st_ino) for path in Path(real_voice_env["XDG_CACHE_HOME"], "talk").iterdir())
 
 
 @contextlib.contextmanager
-def _little_memory(engine: Spawned, most: int) -> Iterator[None]:
-    """Let the process have no more than so many bytes of address space."""
-    before = resource.prlimit(engine.process.pid, resource.RLIMIT_AS, (most, resource.RLIM_INFINITY))
+def _little_memory(engine: Engine, limit: int) -> Iterator[None]:
+    """Limit the address space of the process to this number of bytes."""
+    before = resource.prlimit(engine.process.pid, resource.RLIMIT_AS, (limit, resource.RLIM_INFINITY))
     try:
         yield
     finally:
@@ -307,10 +309,10 @@ def _little_memory(engine: Spawned, most: int) -> Iterator[None]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("megabytes", range(80, 480, 40))
-def test_little_memory_ends_a_sentence_once_and_the_next_is_espeaks(tmp_path: Path, megabytes: int) -> None:
-    """The process may die of it, in numpy's own libraries: they end it if they get none as they are loaded.
+def test_a_sentence_ends_once_with_little_memory_and_espeak_speaks_next(tmp_path: Path, megabytes: int) -> None:
+    """The process may die, because numpy's libraries exit if they get no memory while they are loaded.
 
-    Or an import fails in its midst, and says whatever is missing then.
+    Or an import fails halfway, with an error about any missing name.
     """
     real_voice()
     limit = f"import resource\nresource.setrlimit(resource.RLIMIT_AS, ({megabytes} << 20, -1))"
@@ -322,9 +324,9 @@ def test_little_memory_ends_a_sentence_once_and_the_next_is_espeaks(tmp_path: Pa
             engine.process.wait(20)
             return
         if ended.outcome == protocol.OUTCOME_COMPLETED:
-            assert megabytes > 300, "so much it takes"
+            assert megabytes > 300, "the voice spoke with too little memory"
         else:
-            message = _failed(ended)
+            message = _failure_message(ended)
             assert "there is not enough memory; end another program" in message or install.neural() in message
         assert engine.spoken(TEXT, "g2").outcome == protocol.OUTCOME_COMPLETED
 
@@ -333,13 +335,13 @@ def test_little_memory_ends_a_sentence_once_and_the_next_is_espeaks(tmp_path: Pa
 
 
 @limits()
-def test_a_voice_is_held_and_stopped_while_it_is_loaded_and_then_speaks(place: Path) -> None:
-    with _engine(place, before=SLOW_TO_LOAD, alive_every=SOON) as engine:
+def test_a_sentence_can_be_paused_and_stopped_while_its_voice_loads(folder: Path) -> None:
+    with _engine(folder, before=SLOW_TO_LOAD, alive_every=SOON) as engine:
         engine.say(TEXT, voice=VOICE)
         engine.until(protocol.Alive)
         assert_within(engine.pause(), protocol.STOP_LIMIT_S, "a pause while the voice is loaded")
-        held_until = time.monotonic() + 1.2  # past the loading
-        while time.monotonic() < held_until:
+        resume_at = time.monotonic() + 1.2  # after the voice has been loaded
+        while time.monotonic() < resume_at:
             assert isinstance(engine.event(), protocol.Alive | protocol.VoiceMemory | protocol.VoiceLoaded)
         engine.resume()
         assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
@@ -353,30 +355,28 @@ def test_a_voice_is_held_and_stopped_while_it_is_loaded_and_then_speaks(place: P
 
 
 @limits()
-@pytest.mark.parametrize("asked", ["clauses", "word_positions", "ends_with_abbreviation"])
-def test_a_voice_is_stopped_and_held_while_the_sounds_of_a_text_are_looked_up(place: Path, asked: str) -> None:
-    """Libespeak-ng needs a tenth of a second at once for a clause of 800 bytes of a script that isn't the voice's."""
+@pytest.mark.parametrize("method", ["clauses", "word_positions", "ends_with_abbreviation"])
+def test_a_sentence_can_be_paused_and_stopped_during_phonemization(folder: Path, method: str) -> None:
+    """libespeak-ng needs 0.1 s without interruption for a clause of 800 bytes in a script that the voice can't read."""
     text = "Go. Dr. Who. " + "电池电量低正在返回充电站" * 800
-    tells = f"arguments[0] in seen or seen.append(arguments[0]) or print({asked!r}, file=sys.stderr, flush=True)"
-    with _engine(place, before=first(f"synthesizers.espeak:EspeakPhonemizer.{asked}", tells)) as engine:
+    report = f"arguments[0] in seen or seen.append(arguments[0]) or print({method!r}, file=sys.stderr, flush=True)"
+    with _engine(folder, before=before_call(f"synthesizers.espeak:EspeakPhonemizer.{method}", report)) as engine:
         assert engine.spoken("Go. Go", "g0", voice=VOICE).outcome == protocol.OUTCOME_COMPLETED
-        assert engine.errors_line() == asked
+        assert engine.errors_line() == method
         for number in range(1, 5):
             goal = f"g{number}"
             engine.say(text, goal, voice=VOICE)
-            assert engine.errors_line() == asked
+            assert engine.errors_line() == method
             if number % 2:
-                assert_within(engine.pause(goal), 0.1, "a pause while sounds are looked up")
-            assert_within(engine.stop(goal), 0.05, "a stop while sounds are looked up")
+                assert_within(engine.pause(goal), 0.1, "a pause during phonemization")
+            assert_within(engine.stop(goal), 0.05, "a stop during phonemization")
         assert engine.spoken("espeak", "g20").outcome == protocol.OUTCOME_COMPLETED
 
 
 @limits()
-def test_a_real_voice_is_held_and_stopped_in_mid_sentence_and_ends_well(
-    real: dict[str, str],
-) -> None:
-    """A thread that is left in an inference would have the process abort, and the log tell of a crash."""
-    with Spawned(environment=real) as engine:
+def test_a_real_voice_can_be_paused_and_stopped_and_exits_cleanly(real_voice_env: dict[str, str]) -> None:
+    """If a thread still ran an inference at the exit, the process would abort, and the log would report a crash."""
+    with Engine(environment=real_voice_env) as engine:
         assert engine.spoken("a", "g0", voice=REAL_VOICE).outcome == protocol.OUTCOME_COMPLETED
         engine.say("word " * 500, "g1", voice=REAL_VOICE)
         engine.until(protocol.Word)
@@ -385,15 +385,15 @@ def test_a_real_voice_is_held_and_stopped_in_mid_sentence_and_ends_well(
         engine.until(protocol.Word)
         assert_within(engine.stop("g1"), protocol.STOP_LIMIT_S, "a stop")
         engine.say("word " * 500, "g2", voice=REAL_VOICE)
-        engine.until(protocol.Word)  # seconds of it are still to be made, ahead of what is heard
+        engine.until(protocol.Word)  # seconds of samples are still being computed, ahead of the playback
         engine.hang_up()
         assert engine.process.wait(20) == 0, engine.errors()
 
 
-def test_a_program_that_plays_gets_each_sample_once_whether_it_is_held_or_not(place: Path, player: Player) -> None:
-    """And silence while it is held."""
+def test_a_program_gets_every_sample_once_and_silence_during_a_pause(folder: Path, player: Player) -> None:
+
     text = "one two three four five six"
-    with _engine(place, player.plays()) as engine:
+    with _engine(folder, player.plays()) as engine:
         ended = engine.spoken(text, "g0", voice=VOICE)
         sentence = player.heard.read_bytes()
         assert ended.duration is not None
@@ -402,14 +402,14 @@ def test_a_program_that_plays_gets_each_sample_once_whether_it_is_held_or_not(pl
         engine.say(text, "g1", voice=VOICE)
         engine.until_word(3)
         assert engine.pause() < 0.2
-        assert children(engine.process.pid), "it plays silence"
+        assert children(engine.process.pid), "the player has ended"
         for _ in range(2):
             engine.until(protocol.Alive)
         engine.resume()
         ended = engine.until(protocol.Ended)
         assert ended.outcome == protocol.OUTCOME_COMPLETED
-        assert ended.gap_seconds < protocol.ALIVE_INTERVAL_S, "it was held, and that is no gap"
-        assert [each.number for each in engine.words()] == [*range(1, 7)]
+        assert ended.gap_seconds < protocol.ALIVE_INTERVAL_S, "the pause was counted as a gap"
+        assert [word.number for word in engine.words()] == [*range(1, 7)]
         heard = player.heard.read_bytes()
         assert len(heard) > len(sentence)
         assert without_silence(heard, sentence) == sentence
@@ -419,136 +419,134 @@ def test_a_program_that_plays_gets_each_sample_once_whether_it_is_held_or_not(pl
 
 
 @pytest.mark.parametrize("player", ["pulse", "aplay"])
-def test_the_gaps_that_are_heard_are_told_and_words_when_they_are_heard(place: Path, sink: Sink, player: str) -> None:
-    """A machine that is too slow leaves nothing out, and tells words in the order of the text, however late."""
+def test_gaps_are_counted_and_words_are_reported_when_heard(folder: Path, sink: Sink, player: str) -> None:
+    """A machine that is too slow leaves nothing out, and reports the words in order, however late."""
     text = "one two three four five six seven"
-    with sink.record() as recording, _engine(place, player, sink.env, before=SLOW_TO_SPEAK) as engine:
+    with sink.record() as recording, _engine(folder, player, sink.env, before=SLOW_TO_SPEAK) as engine:
         engine.say(text, voice=VOICE)
-        told = []
+        reported = []
         while not isinstance(event := engine.event(), protocol.Ended):
             if isinstance(event, protocol.Word):
-                told.append((time.monotonic(), event.time))
+                reported.append((time.monotonic(), event.time))
         assert event.outcome == protocol.OUTCOME_COMPLETED
         recording.wait_until_quiet(0.3)
-        # It hums all the time, so any silence is a gap.
-        loud = [at for at, each in enumerate(recording.samples) if abs(int(each)) > 1000]
-        assert [text[each.start : each.end] for each in engine.words()] == text.split()
-    silent = [(here - before) / RATE for before, here in itertools.pairwise(loud) if here - before > 0.05 * RATE]
+        # The voice hums without a pause, so any silence is a gap.
+        loud = [index for index, sample in enumerate(recording.samples) if abs(int(sample)) > 1000]
+        assert _words(engine, text) == text.split()
+    silent = [(after - before) / RATE for before, after in itertools.pairwise(loud) if after - before > 0.05 * RATE]
     assert event.gaps == len(silent) >= 1
     assert event.gap_seconds == pytest.approx(sum(silent), abs=0.1 * len(silent))
     assert event.gap_seconds > 0.5
     assert event.duration is not None
-    assert event.duration - 0.26 == pytest.approx(len(loud) / RATE, abs=0.05), "less the pause at its end"
-    for at, position in told:
-        # A monitor drops some samples when a player runs dry: a word near a gap may be on either side of it.
-        near = (int((position + each) * RATE) for each in (-0.03, 0, 0.03))
-        heard = [recording.time_of(loud[min(len(loud) - 1, max(0, each))]) for each in near]
-        assert heard[0] - 0.1 < at < heard[-1] + 0.1
+    assert event.duration - 0.26 == pytest.approx(len(loud) / RATE, abs=0.05), "without the silence at the end"
+    for reported_at, position in reported:
+        # The monitor drops some samples at a gap, so a word near a gap may be on either side of it.
+        near = (int((position + offset) * RATE) for offset in (-0.03, 0, 0.03))
+        heard = [recording.time_of(loud[min(len(loud) - 1, max(0, index))]) for index in near]
+        assert heard[0] - 0.1 < reported_at < heard[-1] + 0.1
 
 
 @pytest.mark.parametrize("player", [pytest.param("null", marks=pytest.mark.slow), "pulse"])
-def test_a_processor_at_a_fifth_of_its_time_speaks_on_with_gaps(real: dict[str, str], sink: Sink, player: str) -> None:
-    """It stands still for a sixth of a second again and again, as under a limit of the kernel's, and its player too."""
+def test_a_process_that_is_slowed_speaks_with_gaps(real_voice_env: dict[str, str], sink: Sink, player: str) -> None:
+    """The process and its built-in player are stopped for 0.16 s again and again, as under a CPU limit."""
     text = "Please step aside, the robot turns."
-    with Spawned(player, environment={**real, **sink.env}) as engine:
+    with Engine(player, environment={**real_voice_env, **sink.env}) as engine:
         assert engine.spoken("a", "g0", voice=REAL_VOICE).gaps == 0
-        with _slowed(engine, running=0.04, standing=0.16):
-            began = time.monotonic()
+        with _slowed(engine, running=0.04, stopped=0.16):
+            started_at = time.monotonic()
             ended = engine.spoken(text, voice=REAL_VOICE, rate=200)
-            took = time.monotonic() - began
+            took = time.monotonic() - started_at
         assert ended.outcome == protocol.OUTCOME_COMPLETED
         assert ended.duration is not None
-        words = [text[each.start : each.end] for each in engine.words()]
-        assert words == text.replace(",", "").rstrip(".").split()
+        assert _words(engine, text) == text.replace(",", "").rstrip(".").split()
         assert ended.gaps > 2
-        first = next(each for each in engine.words()).time
-        assert 0.5 < ended.gap_seconds < took - ended.duration + first
+        assert 0.5 < ended.gap_seconds < took - ended.duration + engine.words()[0].time
         assert engine.spoken("espeak", "g2").outcome == protocol.OUTCOME_COMPLETED
 
 
 @contextlib.contextmanager
-def _slowed(engine: Spawned, running: float, standing: float) -> Iterator[None]:
-    """Have the process stand still and go on in turn, for so many seconds each."""
-    over = threading.Event()
+def _slowed(engine: Engine, running: float, stopped: float) -> Iterator[None]:
+    """Stop and continue the process in turn, for these numbers of seconds."""
+    done = threading.Event()
 
     def limit() -> None:
-        while not over.wait(running):
+        while not done.wait(running):
             engine.process.send_signal(signal.SIGSTOP)
-            over.wait(standing)
+            done.wait(stopped)
             engine.process.send_signal(signal.SIGCONT)
 
-    limiting = threading.Thread(target=limit)
-    limiting.start()
+    thread = threading.Thread(target=limit)
+    thread.start()
     try:
         yield
     finally:
-        over.set()
-        limiting.join()
+        done.set()
+        thread.join()
 
 
-def test_a_real_voice_says_a_sentence_with_its_words_in_time(real: dict[str, str], tmp_path: Path) -> None:
-    """Each word begins where the sound comes up behind a pause of the sentence: at its stops."""
+def test_the_word_times_of_a_real_voice_match_its_sound(real_voice_env: dict[str, str], tmp_path: Path) -> None:
+    """The first word of each sentence must begin with the sound after the pause."""
     text = "Battery low. Please come home. I am stuck."
     target = tmp_path / "out.wav"
-    with Spawned(f"file:{target}", environment=real) as engine:
+    with Engine(f"file:{target}", environment=real_voice_env) as engine:
         assert engine.spoken(text, rate=200, voice=REAL_VOICE).outcome == protocol.OUTCOME_COMPLETED
-        starts = [each.time for each in engine.words() if text[each.start - 2 : each.start] in {"", ". "}]
+        starts = [word.time for word in engine.words() if text[word.start - 2 : word.start] in {"", ". "}]
     with wave.open(str(target)) as file:
         rate, samples = file.getframerate(), array("h", file.readframes(file.getnframes()))
     loud = [at / rate for at in range(0, len(samples) - 200, 200) if max(map(abs, samples[at : at + 200])) > 1000]
-    onsets = [loud[0], *(here for before, here in itertools.pairwise(loud) if here - before > 0.25)]
+    onsets = [loud[0], *(after for before, after in itertools.pairwise(loud) if after - before > 0.25)]
     assert len(onsets) == len(starts) == 3
     assert starts == pytest.approx(onsets, abs=0.12)
-    quiet = next(number for number, each in enumerate(reversed(samples)) if abs(each) > 330)
-    assert quiet / rate == pytest.approx(0.26, abs=0.01), "the pause at its end"
+    quiet = next(count for count, sample in enumerate(reversed(samples)) if abs(sample) > 330)
+    assert quiet / rate == pytest.approx(0.26, abs=0.01), "the silence at the end"
 
 
-# -- loading beside the speech
+# -- loading during speech
 
 
-def test_voices_are_loaded_one_at_a_time_beside_the_speech_and_told_once_each(place: Path) -> None:
+def test_voices_are_loaded_one_at_a_time_during_speech_and_reported_once(folder: Path) -> None:
     path = "synthesizers.inference:Model._set_halves"
-    slow = first(path, "seen and sys.exit('two at once') or seen.append(1) or time.sleep(0.3) or seen.clear()")
-    tiny_voice.put(place, "second")
-    with _engine(place, before=slow) as engine:
+    slow = before_call(path, "seen and sys.exit('two at once') or seen.append(1) or time.sleep(0.3) or seen.clear()")
+    tiny_voice.put(folder, "second")
+    with _engine(folder, before=slow) as engine:
         for voice in ("piper/second", VOICE, "piper/second", "piper/nobody", VOICE):
             engine.send(protocol.LoadVoice(voice))
         assert engine.spoken(TEXT, voice="en", rate=150).outcome == protocol.OUTCOME_COMPLETED
         loaded = [engine.until(protocol.VoiceLoaded) for _ in range(3 - len(_loaded(engine)))]
-        assert len(loaded) < 3, "some came while it spoke"
-    assert [each.voice for each in _loaded(engine)] == ["piper/second", VOICE, "piper/nobody"]
-    assert [each.error for each in _loaded(engine)] == [None, None, "piper/nobody: its file no longer exists"]
+        assert len(loaded) < 3, "no voice was loaded during the speech"
+    assert [(event.voice, event.error) for event in _loaded(engine)] == [
+        ("piper/second", None),
+        (VOICE, None),
+        ("piper/nobody", "piper/nobody: its file no longer exists"),
+    ]
 
 
-def test_a_voice_that_is_not_loaded_or_was_dropped_is_spoken_by_espeak_in_its_language(place: Path) -> None:
-    about = tiny_voice.description(voice="de")
-    tiny_voice.put(place, "deutsch", config=about)
-    tiny_voice.put(place, "second")
-    _put_wrong(place, "silent")
-    with _engine(place) as engine:
-        for voice, speaker in [(VOICE, "gmw/en-US"), ("piper/deutsch", "gmw/de"), ("piper/wrong", "gmw/en-US")]:
+def test_espeak_speaks_the_language_of_a_voice_that_is_not_loaded(folder: Path) -> None:
+    tiny_voice.put(folder, "deutsch", config=tiny_voice.description(voice="de"))
+    tiny_voice.put(folder, "second")
+    _create_wrong_voice(folder, "silent")
+    with _engine(folder) as engine:
+        for voice, fallback in [(VOICE, "gmw/en-US"), ("piper/deutsch", "gmw/de"), ("piper/wrong", "gmw/en-US")]:
             assert engine.spoken(TEXT, voice, voice=voice, voice_only=False).outcome == protocol.OUTCOME_COMPLETED
-            assert _speaks(engine, voice) == [(speaker, f"{voice} is not loaded")]
+            assert _chosen_voices(engine, voice) == [(fallback, f"{voice} is not loaded")]
             assert len(engine.words(voice)) > 3
-        assert _loaded(engine) == [], "espeak in its place loads nothing: that is the server's to decide"
+        assert _loaded(engine) == [], "a voice was loaded without an order of the server"
         for voice in (VOICE, "piper/second"):
             engine.send(protocol.LoadVoice(voice))
             assert engine.until(protocol.VoiceLoaded).error is None
-            assert (
-                engine.spoken("a", f"{voice} loaded", voice=voice, voice_only=False).outcome
-                == protocol.OUTCOME_COMPLETED
-            )
-            assert _speaks(engine, f"{voice} loaded") == [(voice, None)]
+            goal = f"{voice} loaded"
+            assert engine.spoken("a", goal, voice=voice, voice_only=False).outcome == protocol.OUTCOME_COMPLETED
+            assert _chosen_voices(engine, goal) == [(voice, None)]
         engine.send(protocol.DropVoice(VOICE))
-        for goal, voice, told in [
+        for goal, voice, expected in [
             ("dropped", VOICE, ("gmw/en-US", f"{VOICE} is not loaded")),
             ("kept", "piper/second", ("piper/second", None)),
         ]:
             assert engine.spoken("a", goal, voice=voice, voice_only=False).outcome == protocol.OUTCOME_COMPLETED
-            assert _speaks(engine, goal) == [told]
+            assert _chosen_voices(engine, goal) == [expected]
 
 
-def test_growth_by_each_voice_is_told_and_memory_of_dropped_ones_is_given_back(place: Path) -> None:
+def test_the_memory_of_voices_is_reported_and_freed_when_one_is_dropped(folder: Path) -> None:
     heavy = """
 from talkcli.engine.child.synthesizers import inference
 init, kept = inference.Model.__init__, []
@@ -557,33 +555,33 @@ def heavier(self, *rest):
     self.ballast = []
     for _ in range(700):
         self.ballast.append(b"x" * 60_000)
-        kept.append(bytearray(1000))  # between them, so that the C library keeps what is free
+        kept.append(bytearray(1000))  # in between, so that the C library doesn't return the memory by itself
 inference.Model.__init__ = heavier
 """
-    tiny_voice.put(place, "second")
-    with _engine(place, before=heavy) as engine:
+    tiny_voice.put(folder, "second")
+    with _engine(folder, before=heavy) as engine:
         for voice in (VOICE, "piper/second"):
             engine.send(protocol.LoadVoice(voice))
             assert engine.until(protocol.VoiceMemory).voice == voice
             assert engine.until(protocol.VoiceLoaded).error is None
-        assert engine.spoken("yes").outcome == protocol.OUTCOME_COMPLETED  # the thread that loaded it has ended by then
+        assert engine.spoken("yes").outcome == protocol.OUTCOME_COMPLETED  # by then, the loading thread has ended
         engine.send(protocol.DropVoice("piper/second"))
         assert engine.until(protocol.VoiceMemory).voice == ""
-        sizes = [each.memory for each in engine.events if isinstance(each, protocol.VoiceMemory)]
+        sizes = [event.memory for event in engine.events if isinstance(event, protocol.VoiceMemory)]
     assert sizes[0] > 42e6
     assert sizes[1] - sizes[0] > 40e6
-    assert sizes[1] - sizes[2] > 35e6, "of each piece its whole pages"
+    assert sizes[1] - sizes[2] > 35e6  # the complete pages of each piece
 
 
-def test_a_load_that_hangs_is_given_up_and_the_next_voice_is_loaded(place: Path) -> None:
-    hangs = first("synthesizers.inference:Model.__init__", '"other" in arguments[1] and threading.Event().wait()')
+def test_a_load_that_hangs_is_abandoned_and_the_next_voice_is_loaded(folder: Path) -> None:
+    hangs = before_call("synthesizers.inference:Model.__init__", '"other" in arguments[1] and threading.Event().wait()')
     hangs = f"from talkcli.engine import protocol\nprotocol.LOAD_LIMIT_S = 0.6\n{hangs}"
-    tiny_voice.put(place, "other")
-    with _engine(place, before=hangs) as engine:
+    tiny_voice.put(folder, "other")
+    with _engine(folder, before=hangs) as engine:
         engine.send(protocol.LoadVoice("piper/other"))
         engine.send(protocol.LoadVoice(VOICE))
         hung, loaded = engine.until(protocol.VoiceLoaded), engine.until(protocol.VoiceLoaded)
         assert hung.error == "piper/other was not loaded within 0.6 s; use a faster disk"
         assert (loaded.voice, loaded.error) == (VOICE, None)
         engine.leave()
-        assert engine.process.wait(5) == 0, "a load that hangs keeps no process"
+        assert engine.process.wait(5) == 0, "the hanging load delayed the exit"

@@ -1,7 +1,7 @@
-"""Odd texts through a real neural voice: each has one end, its words in order, and as much sound as it may have.
+"""Odd texts, spoken by a real neural voice: each ends once, with its words in order and a plausible duration.
 
-200 in the slow tests, some in the others; by hand as many as one likes: `TALK_TEST_NEURAL_TEXTS=2000 pytest -m slow -s
-tests/engine/test_neural_texts.py`, with `TALK_TEST_SEED=N` for others. What a process dies of is printed.
+A default run speaks a few texts, and the slow tests speak 200. To choose the number, run `TALK_TEST_NEURAL_TEXTS=2000
+pytest -m slow -s tests/engine/test_neural_texts.py`. `TALK_TEST_SEED=N` makes other texts. Faults are printed.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
-from tests.engine.spawned import Spawned
+from tests.engine.process import Engine
 from tests.faults.test_text_bad import ENDLESS, LONGEST_WORDS, MARKUP, RIGHT_TO_LEFT
 from tests.support.real_voice import REAL_VOICE
-from tests.tools.fuzz_texts import made
+from tests.tools.fuzz_texts import random_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -27,15 +27,16 @@ if TYPE_CHECKING:
 
 MANY = int(os.environ.get("TALK_TEST_NEURAL_TEXTS") or 200)
 SEED = int(os.environ.get("TALK_TEST_SEED") or 18)
-#: … in a default run.
+#: The number of random texts in a default run.
 FEW = 5
-#: Tests that run beside each other, each with a part of the texts; and characters of a text, unless many are asked for.
+#: The number of tests that share the texts, so that they can run in parallel.
 PARTS = 4
+#: The longest text in characters. There is no limit if the number of texts was chosen.
 LONGEST = None if "TALK_TEST_NEURAL_TEXTS" in os.environ else 60
-#: Seconds of sound that a character may make at 450 words per minute, and a text beside that: the name of a picture, or
-#: of a letter of another script, is a sentence.
-A_CHARACTER, BESIDE = 2.5, 1.0
-#: Texts that are odd in a way of their own.
+#: The most seconds of sound at 450 words per minute: for each character, and in addition for the text. A character may
+#: be spoken as a sentence, such as the name of an emoji or of a letter in another script.
+CHARACTER_S, TEXT_S = 2.5, 1.0
+#: Texts that are odd in various ways.
 ODD = [
     *MARKUP,
     *LONGEST_WORDS.values(),
@@ -44,32 +45,32 @@ ODD = [
     *("\x01s\x01100A b", "1,000,000.5", "7" * 60, "IV. XIX. 1/2 3°", "e.g. i.e. U.S.A. Dr. Mr. 5."),
     *("\ufffe\uffff", "\u202ea\u202c\u2067b\u2069"),
 ]
-#: … and long ones, which take half a minute each: all of them if many texts are asked for.
+#: Long texts, which take half a minute each. All are spoken only if the number of texts was chosen.
 LONG = {**ENDLESS, "one word": "x" * 10_000, "words of a letter": "a " * 5_000, "words": "word " * 2_000}
 _CHOSEN = LONG if "TALK_TEST_NEURAL_TEXTS" in os.environ else ("digits", "accents", "one word", "words of a letter")
 
 
 @dataclass
 class Tally:
-    """The ends of the texts."""
+    """The results of the spoken texts."""
 
     outcomes: Counter[str] = field(default_factory=Counter)
-    deaths: list[str] = field(default_factory=list)  # how a process ended, and of which text
-    faults: list[str] = field(default_factory=list)  # what must not be at all
+    deaths: list[str] = field(default_factory=list)  # how a process died, and at which text
+    faults: list[str] = field(default_factory=list)  # other violations
 
     def __str__(self) -> str:
         ended = ", ".join(f"{count} {name}" for name, count in sorted(self.outcomes.items()))
         return f"{ended}; {len(self.deaths)} deaths"
 
 
-def _spoken(texts: Iterable[str], place: Path, env: dict[str, str]) -> Tally:
-    """Speak texts into a file, which takes no time but that of computing, by engine processes that may die."""
+def _speak_all(texts: Iterable[str], folder: Path, env: dict[str, str]) -> Tally:
+    """Speak texts to a file, which is faster than real time. An engine process that dies is replaced."""
     tally = Tally()
-    left = deque(texts)
-    while left:
-        with Spawned(f"file:{place / 'out.wav'}", environment=env) as engine:
-            while left:
-                text = left.popleft()
+    remaining = deque(texts)
+    while remaining:
+        with Engine(f"file:{folder / 'out.wav'}", environment=env) as engine:
+            while remaining:
+                text = remaining.popleft()
                 try:
                     ended = engine.spoken(text, voice=REAL_VOICE)
                 except AssertionError as died:
@@ -91,16 +92,16 @@ def _count(tally: Tally, text: str, ended: protocol.Ended, words: list[protocol.
     seconds = ended.duration or 0.0
     if not words:
         tally.faults.append(f"no words: {shown}")
-    for before, here in pairwise(words):
-        if not (before.end <= here.start and before.time <= here.time and here.number == before.number + 1):
-            tally.faults.append(f"words out of order, {before} {here}: {shown}")
-    if any(not 0 <= each.start < each.end <= len(text) or not 0 <= each.time <= seconds for each in words):
+    for word, after in pairwise(words):
+        if not (word.end <= after.start and word.time <= after.time and after.number == word.number + 1):
+            tally.faults.append(f"words out of order, {word} {after}: {shown}")
+    if any(not 0 <= word.start < word.end <= len(text) or not 0 <= word.time <= seconds for word in words):
         tally.faults.append(f"words outside of the text: {shown}")
-    if not 0 < seconds <= BESIDE + A_CHARACTER * len(text):
+    if not 0 < seconds <= TEXT_S + CHARACTER_S * len(text):
         tally.faults.append(f"{seconds} s: {shown}")
 
 
-def _assert_well(tally: Tally, texts: int) -> None:
+def _assert_no_faults(tally: Tally, texts: int) -> None:
     print(tally, *tally.deaths, *tally.faults, sep="\n")
     assert not tally.faults, tally.faults
     assert not tally.deaths, tally.deaths
@@ -108,23 +109,23 @@ def _assert_well(tally: Tally, texts: int) -> None:
     assert tally.outcomes[protocol.OUTCOME_COMPLETED] > texts // 2
 
 
-def test_odd_texts_have_one_end_each(tmp_path: Path, real: dict[str, str]) -> None:
+def test_each_odd_text_ends_once(tmp_path: Path, real_voice_env: dict[str, str]) -> None:
     source = random.Random(SEED)
-    texts = [each[:25] for each in (*ODD[::5], *(made(source) for _ in range(FEW)))]
-    _assert_well(_spoken(texts, tmp_path, real), len(texts))
+    texts = [text[:25] for text in (*ODD[::5], *(random_text(source) for _ in range(FEW)))]
+    _assert_no_faults(_speak_all(texts, tmp_path, real_voice_env), len(texts))
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600 + MANY)
 @pytest.mark.parametrize("part", range(PARTS))
-def test_many_odd_texts_have_one_end_each(tmp_path: Path, real: dict[str, str], part: int) -> None:
+def test_each_of_many_odd_texts_ends_once(tmp_path: Path, real_voice_env: dict[str, str], part: int) -> None:
     source = random.Random(SEED)
-    texts = [*ODD, *(made(source)[:LONGEST] for _ in range(MANY - len(ODD)))][part::PARTS]
-    _assert_well(_spoken(texts, tmp_path, real), len(texts))
+    texts = [*ODD, *(random_text(source)[:LONGEST] for _ in range(MANY - len(ODD)))][part::PARTS]
+    _assert_no_faults(_speak_all(texts, tmp_path, real_voice_env), len(texts))
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("name", _CHOSEN)
-def test_texts_of_thousands_of_characters_have_one_end_each(tmp_path: Path, real: dict[str, str], name: str) -> None:
-    _assert_well(_spoken([LONG[name]], tmp_path, real), 1)
+def test_a_text_of_thousands_of_characters_ends_once(tmp_path: Path, real_voice_env: dict[str, str], name: str) -> None:
+    _assert_no_faults(_speak_all([LONG[name]], tmp_path, real_voice_env), 1)

@@ -1,4 +1,4 @@
-"""Players that fail, and their processes: never a sentence that counts as spoken, never a hang, nothing left."""
+"""Tests for players that fail, and for their processes: the sentence fails, nothing hangs, and no process remains."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from talkcli.engine import protocol
 from talkcli.engine.child import playback
 from talkcli.engine.child.players.program import PlayerProcess, ProgramPlayer
 from talkcli.engine.players import PlayerCommand
+from tests.engine.process import FAST, SOON, Engine
 from tests.engine.programs import NEVER_READS, PLAYS, SWALLOWS, Player
-from tests.engine.spawned import FAST, SOON, Spawned
 from tests.support import usage
 from tests.support.processes import children
 from tests.support.reference import render, without_leading_zeros
@@ -49,23 +49,23 @@ def _plays(during: str = "pass", after: str = "") -> str:
 
 
 def _failure(command: str, **limits: float) -> tuple[str | None, str | None]:
-    with Spawned(command, limits=limits) as engine:
-        ended = engine.spoken("battery low, please come home")  # so long that its end can be too early
+    with Engine(command, limits=limits) as engine:
+        ended = engine.spoken("battery low, please come home")  # long enough for a player to end too early
         assert ended.outcome == protocol.OUTCOME_FAILED
         assert children(engine.process.pid) == []
         return ended.reason, ended.message
 
 
-def _assert_all_taken(player: Player, ended: protocol.Ended) -> None:
+def _assert_all_accepted(player: Player, ended: protocol.Ended) -> None:
     assert ended.outcome == protocol.OUTCOME_COMPLETED
     assert ended.duration is not None
     assert player.heard.stat().st_size == round(ended.duration * 22050) * 2
 
 
 @pytest.mark.parametrize("during", ["pass", 'print("underrun!!! (at least 0.1 ms long)", file=sys.stderr)'])
-def test_a_good_player_gets_every_sample_and_underruns_are_no_error(player: Player, during: str) -> None:
-    with Spawned(player.plays(during)) as engine:
-        _assert_all_taken(player, engine.spoken(TEXT))
+def test_a_player_gets_every_sample_and_an_underrun_is_not_an_error(player: Player, during: str) -> None:
+    with Engine(player.plays(during)) as engine:
+        _assert_all_accepted(player, engine.spoken(TEXT))
         assert len(engine.words()) == 2
 
 
@@ -92,20 +92,20 @@ def test_a_good_player_gets_every_sample_and_underruns_are_no_error(player: Play
         ),
     ],
 )
-def test_a_player_that_fails_fails_the_sentence_in_words(
+def test_a_failing_player_fails_the_sentence_with_a_readable_message(
     player: Player, code: str, limit: str | None, reason: str, message: str
 ) -> None:
-    told, words = _failure(player.command(code), **({limit: 0.4} if limit else {}))
-    assert told == reason
-    assert re.fullmatch(message, words or ""), words
+    actual_reason, actual_message = _failure(player.command(code), **({limit: 0.4} if limit else {}))
+    assert actual_reason == reason
+    assert re.fullmatch(message, actual_message or ""), actual_message
 
 
-def test_hangs_in_drain(player: Player) -> None:
+def test_a_player_that_hangs_after_the_sound_fails_the_sentence(player: Player) -> None:
     reason, message = _failure(player.plays(after="time.sleep(100)"), DRAIN_LIMIT_S=0.3)
     assert (reason, message) == ("audio_stalled", "player did not exit within 0.3 s after the sound")
 
 
-#: Finds the device held by another, so many times.
+#: Code that reports a busy device, for the given number of tries.
 BUSY = """
 import os, sys
 with open("{tries}", "a") as tries:
@@ -115,27 +115,26 @@ if os.path.getsize("{tries}") <= {times}:
 """
 
 
-def test_a_device_that_is_busy_is_tried_again_for_a_while(player: Player, tmp_path: Path) -> None:
+def test_a_busy_device_is_tried_again_for_a_limited_time(player: Player, tmp_path: Path) -> None:
     tries = tmp_path / "tries"
-    with Spawned(player.command(BUSY.format(tries=tries, times=4) + _plays())) as engine:
-        _assert_all_taken(player, engine.spoken(TEXT))
+    with Engine(player.command(BUSY.format(tries=tries, times=4) + _plays())) as engine:
+        _assert_all_accepted(player, engine.spoken(TEXT))
     command = player.command(BUSY.format(tries=tries, times=1000))
-    with limits(), Spawned(command, alive_every=SOON) as engine:
-        before, began = tries.stat().st_size, time.monotonic()
+    with limits(), Engine(command, alive_every=SOON) as engine:
+        before, started_at = tries.stat().st_size, time.monotonic()
         ended = engine.spoken(TEXT, "g1")
         assert (ended.reason, ended.message) == ("audio_device", "aplay: audio open error: Device or resource busy")
-        assert time.monotonic() - began >= playback.DEVICE_BUSY_LIMIT_S
-        assert_within(
-            time.monotonic() - began, playback.DEVICE_BUSY_LIMIT_S + 1, "the end of a goal whose device is held"
-        )
+        elapsed = time.monotonic() - started_at
+        assert elapsed >= playback.DEVICE_BUSY_LIMIT_S
+        assert_within(elapsed, playback.DEVICE_BUSY_LIMIT_S + 1, "the end of a goal whose device is busy")
         assert tries.stat().st_size > before + 2
         engine.say(TEXT, "g2")
         engine.until(protocol.Alive)
         engine.stop("g2")
 
 
-def test_a_stop_leaves_no_process_of_a_player_that_plays_or_never_reads(player: Player) -> None:
-    with limits(), Spawned(player.plays(), alive_every=SOON) as engine:
+def test_a_stop_leaves_no_player_process(player: Player) -> None:
+    with limits(), Engine(player.plays(), alive_every=SOON) as engine:
         for goal in ("plays", "plays again", "never reads"):
             if goal == "never reads":
                 player.command(NEVER_READS)
@@ -149,23 +148,23 @@ def test_a_stop_leaves_no_process_of_a_player_that_plays_or_never_reads(player: 
         assert engine.words("never reads") == []
 
 
-def test_no_word_is_reported_while_the_player_stands_still(player: Player) -> None:
+def test_no_word_is_reported_while_the_player_stalls(player: Player) -> None:
     stall = 0.5
-    with Spawned(player.plays(f"if 13000 < taken < 13900: time.sleep({stall}); began += {stall}")) as engine:
-        began = time.monotonic()
+    with Engine(player.plays(f"if 13000 < taken < 13900: time.sleep({stall}); started_at += {stall}")) as engine:
+        started_at = time.monotonic()
         engine.say("one two three four five six seven")
-        late = {}
+        delays = {}
         while not isinstance(event := engine.event(), protocol.Ended):
             if isinstance(event, protocol.Word):
-                late[event.time] = time.monotonic() - began - event.time
-        before = [value for position, value in late.items() if position < 0.2]
-        after = [value for position, value in late.items() if position > 0.35]
+                delays[event.time] = time.monotonic() - started_at - event.time
+        before = [delay for position, delay in delays.items() if position < 0.2]
+        after = [delay for position, delay in delays.items() if position > 0.35]
         assert before
         assert after
         assert max(before) + stall - 0.15 < min(after)
 
 
-def test_a_program_that_cannot_be_run_is_named(tmp_path: Path) -> None:
+def test_the_error_names_a_program_that_cannot_be_run(tmp_path: Path) -> None:
     assert _failure("/nonexistent/player --rate {rate}") == ("no_player", 'player "/nonexistent/player" not found')
     assert _failure("'unbalanced") == ("no_player", 'invalid player command "\'unbalanced": no closing quotation')
     path = tmp_path / "garbage"
@@ -179,36 +178,36 @@ def test_a_program_that_cannot_be_run_is_named(tmp_path: Path) -> None:
 
 def test_rate_and_device_reach_the_command(player: Player) -> None:
     code = f"import sys\nopen({str(player.heard)!r}, 'w').write(' '.join(sys.argv[1:]))"
-    with Spawned(f"{player.program(code)} {{rate}} --dev={{device}}", device="hw:1") as engine:
+    with Engine(f"{player.program(code)} {{rate}} --dev={{device}}", device="hw:1") as engine:
         engine.spoken(TEXT)
     assert player.heard.read_text() == "22050 --dev=hw:1"
 
 
-# -- the players that are found on the PATH
+# -- players that are found on the PATH
 
 HOST_IS_DOWN = "import sys\nsys.exit('aplay: main:831: audio open error: Host is down')"
 
 
-def _on_path(folder: Path) -> Spawned:
-    return Spawned(None, environment={"PATH": str(folder)})
+def _on_path(folder: Path) -> Engine:
+    return Engine(None, environment={"PATH": str(folder)})
 
 
-def test_the_next_player_is_tried_with_the_whole_sentence(player: Player, tmp_path: Path) -> None:
+def test_if_a_player_fails_the_next_one_gets_the_whole_sentence(player: Player, tmp_path: Path) -> None:
     player.program(HOST_IS_DOWN, "aplay")
     player.program(_plays().replace("sys.argv[1]", repr(str(player.heard))), "pacat")
     with _on_path(tmp_path) as engine:
         assert engine.until(protocol.Ready).player == "aplay"
         ended = engine.spoken(TEXT)
-        _assert_all_taken(player, ended)
+        _assert_all_accepted(player, ended)
         assert len(engine.words()) == 2
         assert ended.player == "pacat"
-        # It worked, so it is the first next time: the failing one would have left a mark.
+        # pacat worked, so it is tried first the next time. aplay would leave a mark.
         player.program(f"open({str(tmp_path / 'mark')!r}, 'w')", "aplay")
         assert engine.spoken("yes", "g2").outcome == protocol.OUTCOME_COMPLETED
         assert not (tmp_path / "mark").exists()
 
 
-def test_if_all_players_fail_the_first_one_is_quoted(player: Player, tmp_path: Path) -> None:
+def test_if_all_players_fail_the_error_of_the_first_is_reported(player: Player, tmp_path: Path) -> None:
     player.program(HOST_IS_DOWN, "aplay")
     player.program("import sys\nsys.exit('Connection failure: Connection refused')", "pacat")
     with _on_path(tmp_path) as engine:
@@ -216,7 +215,7 @@ def test_if_all_players_fail_the_first_one_is_quoted(player: Player, tmp_path: P
         assert (ended.reason, ended.message) == ("audio_device", "aplay: audio open error: Host is down")
 
 
-def test_a_player_that_took_sound_is_not_replaced(player: Player, tmp_path: Path) -> None:
+def test_a_player_that_accepted_sound_is_not_replaced(player: Player, tmp_path: Path) -> None:
     code = _plays("if taken > 8000: sys.exit('write error: No such device')")
     player.program(code.replace("sys.argv[1]", repr(str(player.heard))), "aplay")
     player.program(f"open({str(tmp_path / 'mark')!r}, 'w')", "pacat")
@@ -226,18 +225,18 @@ def test_a_player_that_took_sound_is_not_replaced(player: Player, tmp_path: Path
         assert not (tmp_path / "mark").exists()
 
 
-def test_no_player_at_all_says_what_to_install(tmp_path: Path) -> None:
+def test_without_any_player_the_error_lists_packages_to_install(tmp_path: Path) -> None:
     with _on_path(tmp_path) as engine:
         assert engine.until(protocol.Ready).player is None
         ended = engine.spoken(TEXT)
         assert ended.reason == "no_player"
-        wanted = "no player found; install alsa-utils (aplay), pulseaudio-utils (pacat) or pipewire-bin (pw-cat)"
-        assert ended.message == wanted
+        expected = "no player found; install alsa-utils (aplay), pulseaudio-utils (pacat) or pipewire-bin (pw-cat)"
+        assert ended.message == expected
 
 
-def test_no_descriptor_is_left_over(player: Player) -> None:
-    with Spawned(player.command("raise SystemExit(1)")) as engine:
-        engine.until(protocol.VoiceList)  # they are read from files, once
+def test_failed_players_leave_no_descriptor_open(player: Player) -> None:
+    with Engine(player.command("raise SystemExit(1)")) as engine:
+        engine.until(protocol.VoiceList)  # after the voice files have been read
         engine.spoken(TEXT, "g0")
         before = os.listdir(f"/proc/{engine.process.pid}/fd")
         for number in range(1, 6):
@@ -248,21 +247,21 @@ def test_no_descriptor_is_left_over(player: Player) -> None:
 # -- a player's process
 
 
-#: Tells when a player is started, a text is looked at, and a process is forked: a line each.
+#: Code that writes a line when a player is started, when a process is forked, and when the text is read.
 _WATCHED = """
 from talkcli.engine.child.synthesizers import guard
-tell = lambda what: sys.stderr.write(what + "\\n")
-sys.addaudithook(lambda name, _: name in ("os.posix_spawn", "os.fork", "subprocess.Popen") and tell(name))
+log = lambda event: sys.stderr.write(event + "\\n")
+sys.addaudithook(lambda name, _: name in ("os.posix_spawn", "os.fork", "subprocess.Popen") and log(name))
 guarded = guard.guarded
-guard.guarded = lambda *text: (tell("text"), guarded(*text))[1]
+guard.guarded = lambda *text: (log("text"), guarded(*text))[1]
 """
 
 
 def _status(child: PlayerProcess, seconds: float = 10.0) -> int:
-    """Wait for a child's end, and return its status."""
+    """Wait for the end of a child, and return its status."""
     end = time.monotonic() + seconds
     while (status := child.poll()) is None:
-        assert time.monotonic() < end, "it has not ended"
+        assert time.monotonic() < end, "the child has not ended"
         child.await_end(0.1)
     child.release()
     return status
@@ -272,20 +271,20 @@ def _run(script: str, *inherited: int) -> PlayerProcess:
     return PlayerProcess(("/bin/sh", "-c", script), inherited)
 
 
-def test_the_holders_of_a_pipe_are_looked_for_no_longer_than_it_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_search_for_a_pipes_holders_ends_when_it_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     reading, writing = os.pipe()
-    looked: list[str] = []
+    searched: list[str] = []
 
-    def links(folder: str) -> list[str]:
-        looked.append(folder)
-        if len(looked) == 2:
+    def read_links(folder: str) -> list[str]:
+        searched.append(folder)
+        if len(searched) == 2:
             os.close(writing)
         return []
 
-    monkeypatch.setattr(processes, "_read_links", links)
+    monkeypatch.setattr(processes, "_read_links", read_links)
     monkeypatch.setattr(processes, "process_ids", lambda: [-1, -2, -3, -4])
     assert not processes.kill_holders(reading)
-    assert looked == ["/proc/-1/fd", "/proc/-2/fd"]
+    assert searched == ["/proc/-1/fd", "/proc/-2/fd"]
     os.close(reading)
 
 
@@ -298,16 +297,16 @@ def test_the_holders_of_a_pipe_are_looked_for_no_longer_than_it_is_held(monkeypa
         ("exit 0", 0),
         ("exit 7", 7),
         ("kill -TERM $$", -signal.SIGTERM),
-        # Python ignores SIGPIPE; a player that went on ignoring it would never end.
+        # Python ignores SIGPIPE. A player that inherits this would never end.
         ("kill -PIPE $$; exit 3", -signal.SIGPIPE),
     ],
 )
-def test_the_status_of_a_child_is_that_of_its_end(script: str, status: int) -> None:
+def test_a_child_reports_its_exit_status(script: str, status: int) -> None:
     assert _status(_run(script)) == status
 
 
-def test_a_failed_start_leaves_nothing_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PATH", str(tmp_path))  # of folders that this user may enter: of others the error is theirs
+def test_a_failed_start_leaves_no_descriptor_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))  # a folder that this user can't enter would cause a different error
     plain = tmp_path / "plain"
     plain.write_text("no program")
     before = os.listdir("/proc/self/fd")
@@ -318,8 +317,8 @@ def test_a_failed_start_leaves_nothing_open(tmp_path: Path, monkeypatch: pytest.
     assert os.listdir("/proc/self/fd") == before
 
 
-def test_a_child_that_is_killed_while_the_interpreter_exits_causes_no_error() -> None:
-    """pyttsx3 stops its driver at that time. An error would hide the one that has ended the process."""
+def test_killing_a_child_while_the_interpreter_exits_causes_no_error() -> None:
+    """pyttsx3 stops its driver at that time. An error would hide the one that ended the process."""
     script = """
 import sys
 from talkcli.engine.child.players.program import ProgramPlayer
@@ -333,18 +332,18 @@ sys.modules["driver"] = Driver()
     assert subprocess.run([sys.executable, "-c", script], capture_output=True, check=True).stderr == b""
 
 
-def test_a_child_has_three_streams_the_inherited_descriptors_and_its_leash() -> None:
+def test_a_child_gets_only_its_streams_leash_and_inherited_descriptors() -> None:
     reading, writing = os.pipe()
     before = usage.descriptors(os.getpid())
     child = _run("kill -STOP $$", writing)
-    # The files that a program opens while it is loaded are closed when it has stopped itself.
+    # Once the shell has stopped itself, the files that the loader opened are closed.
     os.waitid(os.P_PID, child.pid, os.WSTOPPED | os.WNOWAIT)
-    its = usage.descriptors(child.pid)
-    assert its.pop(1) == os.devnull
-    assert its.pop(writing) == os.readlink(f"/proc/self/fd/{writing}")
-    ours = {os.readlink(f"/proc/self/fd/{each.fileno()}") for each in (child.stdin, child.stderr, child._leash)}
-    assert ours <= set(its.values())
-    assert set(its.values()) - ours <= set(before.values()), "nothing else was opened for it"
+    descriptors = usage.descriptors(child.pid)
+    assert descriptors.pop(1) == os.devnull
+    assert descriptors.pop(writing) == os.readlink(f"/proc/self/fd/{writing}")
+    shared = {os.readlink(f"/proc/self/fd/{file.fileno()}") for file in (child.stdin, child.stderr, child._leash)}
+    assert shared <= set(descriptors.values())
+    assert set(descriptors.values()) - shared <= set(before.values()), "the child got other descriptors"
     assert not os.get_inheritable(writing)
     child.kill()
     _status(child)
@@ -353,27 +352,27 @@ def test_a_child_has_three_streams_the_inherited_descriptors_and_its_leash() -> 
     os.close(writing)
 
 
-@pytest.mark.parametrize("ends", [True, False], ids=["ended by itself", "killed"])
-def test_all_that_a_child_has_started_ends_with_it(ends: bool) -> None:
+@pytest.mark.parametrize("exits", [True, False], ids=["exits", "is killed"])
+def test_processes_that_a_child_started_end_with_it(exits: bool) -> None:
     reading, writing = os.pipe()
-    child = _run(f"sleep 100 & echo . >&2; {'exit 7' if ends else 'wait'}", writing)
+    child = _run(f"sleep 100 & echo . >&2; {'exit 7' if exits else 'wait'}", writing)
     os.close(writing)
     os.set_blocking(child.stderr.fileno(), True)
     child.stderr.read(1)
-    if not ends:
+    if not exits:
         child.kill()
-    assert _status(child) == (7 if ends else -signal.SIGKILL)
-    assert select.select([reading], [], [], 0.1)[0], "somebody holds it"
+    assert _status(child) == (7 if exits else -signal.SIGKILL)
+    assert select.select([reading], [], [], 0.1)[0], "a process still has the pipe open"
     assert os.read(reading, 1) == b""
     os.close(reading)
 
 
-#: Starts a process in a session of its own, and lives no longer itself.
+#: A program that starts a process in another session, and exits when that process is ready.
 _LEAVES = """
 import os, sys, time
-ready, begun = os.pipe()
+ready, started = os.pipe()
 if os.fork():
-    os.close(begun)
+    os.close(started)
     os.read(ready, 1)
     os._exit(0)
 os.setsid()
@@ -386,62 +385,62 @@ def _leaving(then: str, *inherited: int) -> PlayerProcess:
     return PlayerProcess((sys.executable, "-S", "-c", _LEAVES.format(then=then)), inherited)
 
 
-def test_a_process_that_left_its_session_is_killed_too_before_it_counts_as_ended() -> None:
+def test_a_process_that_left_the_session_is_killed_before_the_child_ends() -> None:
     reading, writing = os.pipe()
-    child = _leaving("os.write(begun, b'.')", writing)
+    child = _leaving("os.write(started, b'.')", writing)
     os.close(writing)
     assert _status(child) == 0
-    # It closes one descriptor after the other, and this one last.
-    assert select.select([reading], [], [], 5)[0], "somebody holds it"
+    # The dying process closes its descriptors one by one, and the pipe last.
+    assert select.select([reading], [], [], 5)[0], "a process still has the pipe open"
     assert os.read(reading, 1) == b""
     os.close(reading)
 
 
-def test_a_process_that_left_its_session_and_closed_its_descriptors_is_left_alone() -> None:
+def test_a_process_that_closed_its_inherited_descriptors_is_not_killed() -> None:
     reading, writing = os.pipe()
     child = _leaving(f"os.dup2({writing}, 1); os.closerange(2, 100); os.write(1, b'%d' % os.getpid())", writing)
     os.close(writing)
     assert _status(child) == 0
-    stranger = int(os.read(reading, 10))
+    survivor = int(os.read(reading, 10))
     os.set_blocking(reading, False)
     with pytest.raises(BlockingIOError):
-        os.read(reading, 1)  # it lives, as it holds this
-    os.kill(stranger, signal.SIGKILL)
+        os.read(reading, 1)  # the process is alive, because the pipe is open
+    os.kill(survivor, signal.SIGKILL)
     os.close(reading)
 
 
-def test_a_player_finds_a_piece_at_a_time() -> None:
+def test_a_program_gets_one_piece_at_a_time() -> None:
     player = ProgramPlayer(PlayerCommand("sleep", ("sleep", "100"), read_ahead=0))
     assert [player.offer(memoryview(bytes(882))) for _ in range(2)] == [882, 0]
     assert (player.consumed(), player.proven) == (0, False)
     player.kill()
     end = time.monotonic() + 10
     while not player.gone():
-        assert time.monotonic() < end, "it has not ended"
-        time.sleep(0.001)  # on a busy machine it is killed later than `kill` waits for
+        assert time.monotonic() < end, "the player has not ended"
+        time.sleep(0.001)  # on a busy machine, `kill` returns before the player is dead
 
 
 # -- in an engine process
 
 
-def test_no_memory_is_copied_for_it_and_it_starts_before_the_text_is_read(player: Player) -> None:
-    """A fork takes 3 ms, the synthesis 2, and the player itself 5 to 15: together, not one after the other."""
-    with Spawned(player.plays(), before=_WATCHED) as engine:
+def test_a_player_is_spawned_without_a_fork_before_the_text_is_read(player: Player) -> None:
+    """A fork would take 3 ms. The player takes 5 to 15 ms to start, while the text is synthesized in 2 ms."""
+    with Engine(player.plays(), before=_WATCHED) as engine:
         assert engine.spoken("battery low").outcome == protocol.OUTCOME_COMPLETED
         engine.leave()
         assert engine.errors().split() == ["os.posix_spawn", "text"]
 
 
-def test_a_text_without_a_sound_is_no_fault_of_the_player(player: Player) -> None:
+def test_a_text_without_sound_is_not_reported_as_a_player_error(player: Player) -> None:
     broken = player.program("")
     broken.write_text("#!/no/such/interpreter")
-    with Spawned(str(broken)) as engine:
+    with Engine(str(broken)) as engine:
         silent, spoken = engine.spoken("...", "g1"), engine.spoken("battery low", "g2")
         assert (silent.reason, spoken.reason) == ("nothing_to_say", "no_player")
         assert children(engine.process.pid) == []
 
 
-def test_a_player_for_another_rate_is_replaced_before_the_first_sample(player: Player) -> None:
+def test_a_player_with_a_wrong_rate_is_replaced_before_the_first_sample(player: Player) -> None:
     before = """
 from talkcli.engine.child.synthesizers import espeak
 load_library = espeak.load_library
@@ -449,20 +448,20 @@ espeak.load_library = lambda: (*load_library()[:2], 16_000)
 """
     rates = player.heard.with_name("rates")
     program = player.plays(f"open({str(rates)!r}, 'a').write(sys.argv[2] + ' ')")
-    with Spawned(f"{program} {{rate}}", before=before) as engine:
+    with Engine(f"{program} {{rate}}", before=before) as engine:
         assert engine.spoken("battery low").outcome == protocol.OUTCOME_COMPLETED
     assert set(rates.read_text().split()) == {"22050"}
     assert player.heard.read_bytes() == without_leading_zeros(render(["battery low"], rate=FAST)[0]).tobytes()
 
 
-def test_all_that_a_player_has_started_dies_with_a_killed_process(tmp_path: Path) -> None:
-    """Even programs that a shell has started behind itself. No sound comes to a player before it is tied."""
-    begun, script = tmp_path / "begun", tmp_path / "pipeline"
-    os.mkfifo(begun)
-    script.write_text(f"#!/bin/sh\nsleep 100 &\nhead -c 1 > /dev/null\necho > {begun}\nwait\n")
+def test_processes_that_a_player_started_die_with_a_killed_engine(tmp_path: Path) -> None:
+    """The player is a shell script with a background process. It reports its start once it has got sound."""
+    started, script = tmp_path / "started", tmp_path / "pipeline"
+    os.mkfifo(started)
+    script.write_text(f"#!/bin/sh\nsleep 100 &\nhead -c 1 > /dev/null\necho > {started}\nwait\n")
     script.chmod(0o755)
-    with Spawned(str(script)) as engine:
+    with Engine(str(script)) as engine:
         engine.say("one two three")
-        begun.read_text()
+        started.read_text()
         os.kill(engine.process.pid, signal.SIGKILL)
         assert engine.all_gone()

@@ -1,4 +1,4 @@
-"""Players that have a name, their command lines and errors; the player "file:"; and whether anything may sound."""
+"""Tests for player commands and their errors, the player "file:", and the check for any audio output."""
 
 from __future__ import annotations
 
@@ -16,42 +16,42 @@ from talkcli.engine.child.players.builtin import WavPlayer, WavStreamPlayer
 from talkcli.engine.child.players.chooser import PlayerChooser
 from talkcli.engine.child.players.program import MAX_ERROR_LINE_BYTES, ErrorOutput, ProgramPlayer
 from talkcli.engine.players import PACKAGES, PLAYERS, PlayerMissing, player_commands
-from tests.engine.spawned import Spawned
+from tests.engine.process import Engine
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from tests.support.sink import Sink
 
-#: Sets which programs can be run.
-There = Callable[[set[str]], None]
+#: Replaces the set of installed programs.
+Install = Callable[[set[str]], None]
 
 
 @pytest.fixture
-def there(monkeypatch: pytest.MonkeyPatch) -> There:
-    return lambda found: monkeypatch.setattr(players, "on_path", found.__contains__)
+def install(monkeypatch: pytest.MonkeyPatch) -> Install:
+    return lambda programs: monkeypatch.setattr(players, "on_path", programs.__contains__)
 
 
 def _names(player: str | None, last: str | None = None) -> list[str]:
     return [command.name for command in player_commands(player, None, 22050, last)]
 
 
-def test_the_players_that_are_there_are_tried_and_the_one_that_worked_comes_first(there: There) -> None:
-    there({"aplay", "pw-cat", "pacat"})
+def test_installed_players_are_tried_and_the_last_that_worked_comes_first(install: Install) -> None:
+    install({"aplay", "pw-cat", "pacat"})
     assert _names(None) == ["aplay", "pacat", "pw-cat"]
     assert _names(None, "pw-cat") == ["pw-cat", "aplay", "pacat"]
     assert _names("pacat", "aplay") == ["pacat"]
-    there({"pacat"})
+    install({"pacat"})
     assert _names(None) == ["pacat"]
 
 
-def test_the_automatic_choice_has_the_players_whose_rows_say_so_and_programs_come_last(there: There) -> None:
-    there({*PACKAGES})
+def test_the_automatic_choice_tries_built_in_players_before_programs(install: Install) -> None:
+    install({*PACKAGES})
     tried = []
     for opens in PlayerChooser(protocol.Configure(0, None, None, None, None)).candidates(22050):
         assert isinstance(opens, partial)
         tried.append(opens.args[0] if isinstance(opens.args[0], str) else opens.args[0].name)
-    automatic = [name for name, each in PLAYERS.items() if each.automatic]
+    automatic = [name for name, row in PLAYERS.items() if row.automatic]
     assert tried == sorted(automatic, key=PACKAGES.__contains__)
 
 
@@ -59,14 +59,14 @@ def test_the_automatic_choice_has_the_players_whose_rows_say_so_and_programs_com
     ("player", "expected"),
     [("aplay", ["-D", "usb"]), ("pacat", ["-d", "usb"]), ("pw-cat", ["--target=usb", "-"])],
 )
-def test_the_device_is_given_in_the_players_own_words(there: There, player: str, expected: list[str]) -> None:
-    there({player})
+def test_the_device_is_passed_in_the_players_own_syntax(install: Install, player: str, expected: list[str]) -> None:
+    install({player})
     (command,) = player_commands(player, "usb", 16000)
     assert list(command.argv[-len(expected) :]) == expected
     assert "16000" in " ".join(command.argv) or b"\x80\x3e\x00\x00" in command.preamble
 
 
-def test_a_player_with_a_name_that_is_no_program_is_built_in(sink: Sink, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_player_that_is_not_a_program_is_built_in(sink: Sink, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in sink.env.items():
         monkeypatch.setenv(name, value)
     for name in PLAYERS.keys() - PACKAGES.keys():
@@ -78,15 +78,15 @@ def test_a_player_with_a_name_that_is_no_program_is_built_in(sink: Sink, monkeyp
         assert player.gone()
 
 
-def test_a_command_line_is_split_without_a_shell(there: There) -> None:
-    there({"/opt/my"})
+def test_a_command_line_is_split_without_a_shell(install: Install) -> None:
+    install({"/opt/my"})
     (command,) = player_commands("/opt/my player -r{rate} '{device} x' $HOME", None, 22050)
     assert command.argv == ("/opt/my", "player", "-r22050", "default x", "$HOME")
     assert command.name == "my"
 
 
 @pytest.mark.parametrize(
-    ("player", "words"),
+    ("player", "message"),
     [
         ("pacat", 'player "pacat" not found; install pulseaudio-utils'),
         ("sox -", 'player "sox" not found'),
@@ -95,18 +95,18 @@ def test_a_command_line_is_split_without_a_shell(there: There) -> None:
         ("'", "no closing quotation"),
     ],
 )
-def test_a_player_that_is_not_there_is_an_error(there: There, player: str, words: str) -> None:
-    there(set())
-    with pytest.raises(PlayerMissing, match=words):
+def test_a_missing_player_is_an_error(install: Install, player: str, message: str) -> None:
+    install(set())
+    with pytest.raises(PlayerMissing, match=message):
         player_commands(player, None, 22050)
     (opens,) = PlayerChooser(protocol.Configure(0, None, player, None, None)).candidates(22050)
-    with pytest.raises(CannotSpeak, match=words) as caught:
+    with pytest.raises(CannotSpeak, match=message) as caught:
         opens()
     assert caught.value.reason == "no_player"
 
 
 @pytest.mark.parametrize(
-    ("said", "line"),
+    ("output", "line"),
     [
         ("", None),
         ("underrun!!! (at least 12.3 ms long)\n", None),
@@ -127,29 +127,29 @@ def test_a_player_that_is_not_there_is_an_error(there: There, player: str, words
         ("caf\xe9\n", "café"),
     ],
 )
-def test_the_line_that_names_the_error_is_found(said: str, line: str | None) -> None:
-    complaint = ErrorOutput()
-    for byte in said.encode():
-        complaint.feed(bytes([byte]))
-    assert complaint.find_error() == line
+def test_the_error_line_is_found_in_standard_error(output: str, line: str | None) -> None:
+    errors = ErrorOutput()
+    for byte in output.encode():
+        errors.feed(bytes([byte]))
+    assert errors.find_error() == line
 
 
-def test_a_flood_of_standard_error_is_not_kept() -> None:
-    complaint = ErrorOutput()
+def test_only_the_start_of_a_flood_of_standard_error_is_kept() -> None:
+    errors = ErrorOutput()
     for _ in range(100):
-        complaint.feed(b"x" * 10_000)
-    assert complaint.find_error() == "x" * MAX_ERROR_LINE_BYTES
+        errors.feed(b"x" * 10_000)
+    assert errors.find_error() == "x" * MAX_ERROR_LINE_BYTES
 
 
-# -- whether anything could sound
+# -- whether the machine has any audio output
 
 
 @pytest.fixture
 def bare(tmp_path: Path) -> dict[str, str]:
-    """The environment of a container that was given nothing: no sound device, no sound server, no settings."""
+    """Return the environment of a container without a sound device, a sound server, or audio settings."""
     for name in ("home", "run", "snd", "etc"):
         (tmp_path / name).mkdir()
-    for name in ("controlC0", "pcmC0D0c", "timer"):  # a microphone alone
+    for name in ("controlC0", "pcmC0D0c", "timer"):  # a microphone, but no loudspeaker
         (tmp_path / "snd" / name).touch()
     put(tmp_path / "etc/pulse/client.conf", "# default-server =\nautospawn = no\n")
     return {"HOME": f"{tmp_path}/home", "XDG_RUNTIME_DIR": f"{tmp_path}/run"}
@@ -160,20 +160,20 @@ def put(path: Path, text: str = "") -> None:
     path.write_text(text, encoding="utf-8")
 
 
+#: Returns whether an environment of the container has no audio output.
+HasNoOutput = Callable[[dict[str, str]], bool]
+
+
 @pytest.fixture
-def nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[dict[str, str]], bool]:
-    """Tells whether nothing sounds in an environment of that container."""
-    monkeypatch.setattr(os, "getuid", lambda: 4_242_424)  # this machine's user may have a sound server
-    monkeypatch.setattr(players, "_SYSTEM_PULSE", f"{tmp_path}/system")  # and this machine
+def has_no_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> HasNoOutput:
+    monkeypatch.setattr(os, "getuid", lambda: 4_242_424)  # the real user may have a sound server
+    monkeypatch.setattr(players, "_SYSTEM_PULSE", f"{tmp_path}/system")  # so may the real system
     return lambda env: players.has_no_output(env, f"{tmp_path}/snd", f"{tmp_path}/etc")
 
 
-Nothing = Callable[[dict[str, str]], bool]
-
-
-def test_nothing_is_there(tmp_path: Path, bare: dict[str, str], nothing: Nothing) -> None:
-    assert nothing(bare)
-    assert nothing({})
+def test_a_bare_container_has_no_output(tmp_path: Path, bare: dict[str, str], has_no_output: HasNoOutput) -> None:
+    assert has_no_output(bare)
+    assert has_no_output({})
     assert players.has_no_output({}, f"{tmp_path}/gone", f"{tmp_path}/gone")
 
 
@@ -189,35 +189,39 @@ def test_nothing_is_there(tmp_path: Path, bare: dict[str, str], nothing: Nothing
         "etc/asound.conf",
     ],
 )
-def test_anything_there_may_sound(tmp_path: Path, bare: dict[str, str], nothing: Nothing, path: str) -> None:
+def test_a_device_a_socket_or_a_configuration_counts_as_output(
+    tmp_path: Path, bare: dict[str, str], has_no_output: HasNoOutput, path: str
+) -> None:
     put(tmp_path / path)
-    assert not nothing(bare)
+    assert not has_no_output(bare)
 
 
 @pytest.mark.parametrize("path", ["home/.config/pulse/client.conf", "etc/pulse/client.conf.d/00-host.conf"])
-def test_a_server_in_settings_may_sound(tmp_path: Path, bare: dict[str, str], nothing: Nothing, path: str) -> None:
+def test_a_configured_sound_server_counts_as_output(
+    tmp_path: Path, bare: dict[str, str], has_no_output: HasNoOutput, path: str
+) -> None:
     put(tmp_path / path, "autospawn = no\n")
-    assert nothing(bare)
+    assert has_no_output(bare)
     put(tmp_path / path, "autospawn = no\n  default-server = unix:/run/host/pulse\n")
-    assert not nothing(bare)
+    assert not has_no_output(bare)
 
 
 @pytest.mark.parametrize("name", ["PULSE_SERVER", "PULSE_CLIENTCONFIG", "PIPEWIRE_REMOTE", "ALSA_CONFIG_PATH"])
-def test_a_place_that_a_variable_names_may_sound(bare: dict[str, str], nothing: Nothing, name: str) -> None:
-    assert nothing({**bare, name: ""})
-    assert not nothing({**bare, name: "somewhere"})
+def test_an_audio_variable_counts_as_output(bare: dict[str, str], has_no_output: HasNoOutput, name: str) -> None:
+    assert has_no_output({**bare, name: ""})
+    assert not has_no_output({**bare, name: "somewhere"})
 
 
-def test_sound_servers_are_those_of_the_environment_and_of_the_users(tmp_path: Path) -> None:
+def test_sound_server_sockets_are_found_through_the_environment(tmp_path: Path) -> None:
     env = {name: f"{tmp_path}/{name}" for name in ("XDG_RUNTIME_DIR", "PULSE_RUNTIME_PATH", "PIPEWIRE_RUNTIME_DIR")}
-    there = ["XDG_RUNTIME_DIR/pulse/native", "PULSE_RUNTIME_PATH/native", "PIPEWIRE_RUNTIME_DIR/pipewire-0"]
-    for each in there:
-        put(tmp_path / each)
-    found = [each.removeprefix(f"{tmp_path}/") for each in players.sound_server_sockets(env)]
-    assert [each for each in found if not each.startswith("/run/")] == there
+    expected = ["XDG_RUNTIME_DIR/pulse/native", "PULSE_RUNTIME_PATH/native", "PIPEWIRE_RUNTIME_DIR/pipewire-0"]
+    for path in expected:
+        put(tmp_path / path)
+    sockets = [path.removeprefix(f"{tmp_path}/") for path in players.sound_server_sockets(env)]
+    assert [path for path in sockets if not path.startswith("/run/")] == expected
 
 
-# -- the player "file:", whose WAV file is valid at any time and never somebody else's
+# -- the player "file:". Its WAV file is always valid, and other files are never changed
 
 
 def _write(path: Path, data: bytes, rate: int = 22050) -> None:
@@ -233,7 +237,7 @@ def _read(path: Path) -> bytes:
         return file.readframes(file.getnframes())
 
 
-def test_sentences_are_appended_and_leftovers_of_a_crash_are_cut_off(tmp_path: Path) -> None:
+def test_sentences_are_appended_and_remains_of_a_crash_are_cut_off(tmp_path: Path) -> None:
     path = tmp_path / "x.wav"
     path.touch()
     _write(path, b"one ")
@@ -263,7 +267,7 @@ def _stereo(path: Path) -> None:
         file.writeframes(b"12345678")
 
 
-def _with_a_chunk_behind(path: Path) -> None:
+def _with_another_chunk(path: Path) -> None:
     _write(path, b"one ")
     data = bytearray(path.read_bytes() + b"LIST\x04\0\0\0INFO")
     data[4:8] = (len(data) - 8).to_bytes(4, "little")
@@ -284,13 +288,13 @@ def _other_rate(path: Path) -> None:
 
 
 def _of_unknown_length(path: Path) -> None:
-    """Write as `say -o -` does."""
+    """Write a WAV stream, as `say -o -` does."""
     with path.open("wb") as file:
         WavStreamPlayer(file.fileno(), 22050, first=True).offer(memoryview(b"one "))
 
 
-@pytest.mark.parametrize("make", [_of_unknown_length, _stereo, _with_a_chunk_behind, _cut_short, _text, _other_rate])
-def test_other_content_is_refused_and_left_alone(tmp_path: Path, make: Callable[[Path], None]) -> None:
+@pytest.mark.parametrize("make", [_of_unknown_length, _stereo, _with_another_chunk, _cut_short, _text, _other_rate])
+def test_a_file_with_other_content_is_refused_and_not_changed(tmp_path: Path, make: Callable[[Path], None]) -> None:
     path = tmp_path / "x.wav"
     make(path)
     before = path.read_bytes()
@@ -301,7 +305,7 @@ def test_other_content_is_refused_and_left_alone(tmp_path: Path, make: Callable[
     assert path.read_bytes() == before
 
 
-def test_a_path_that_takes_no_samples_is_refused_and_no_descriptor_is_left(tmp_path: Path) -> None:
+def test_an_unsuitable_path_is_refused_and_leaves_no_descriptor_open(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     before = os.listdir("/proc/self/fd")
     for path in (tmp_path, tmp_path / "pipe", tmp_path / "missing" / "x.wav", "", "/dev/null", "/dev/full"):
@@ -311,9 +315,9 @@ def test_a_path_that_takes_no_samples_is_refused_and_no_descriptor_is_left(tmp_p
     assert os.listdir("/proc/self/fd") == before
 
 
-def test_the_error_reaches_the_goal_and_a_stop_leaves_a_valid_file(tmp_path: Path) -> None:
+def test_a_goal_reports_the_file_error_and_a_stop_leaves_a_valid_file(tmp_path: Path) -> None:
     path = tmp_path / "missing" / "x.wav"
-    with Spawned(f"file:{path}") as engine:
+    with Engine(f"file:{path}") as engine:
         ended = engine.spoken("yes", "g1")
         assert (ended.reason, ended.message) == ("audio_device", f"{path} cannot be written: No such file or directory")
         path.parent.mkdir()

@@ -1,6 +1,7 @@
-"""The player "pulse" at a real sound server, with a relay before it: answers between any two calls, in pieces, errors.
+"""Tests for the player "pulse", connected to a real sound server through a relay.
 
-What happens to the device (unplugged, suspended, muted, moved) is done to a real one in `tests/faults`.
+The relay delays, splits and cuts the server's messages, and replaces them with errors. `tests/faults` tests a device
+that is unplugged, suspended, muted or moved.
 """
 
 from __future__ import annotations
@@ -34,43 +35,43 @@ if TYPE_CHECKING:
 
 RATE = 22050
 _PIECE = int(PIECE_S * RATE) * SAMPLE_BYTES
-#: Seconds of sound: more than the server holds, so that it has to ask for some of it.
+#: Seconds of sound: more than the server's buffer holds, so that it must request the rest.
 SECONDS = 0.2
 SOUND = b"".join((number % 3000).to_bytes(2, "little") for number in range(int(SECONDS * RATE)))
-#: Seconds after which nothing more is awaited: there is always something that is due sooner.
+#: Seconds after which a wait fails, because the next event is always due sooner.
 PATIENCE = 5.0
-#: The server's own numbers: access denied, no such entity, connection killed, and one that nobody knows.
+#: Error codes of the server: access denied, no such entity, connection killed, and an unknown one.
 ERRORS = [1, 5, 12, 4711]
 
 
 class Rig:
-    """A player behind a relay; `wait` knows the player's interests and no more, like the playback."""
+    """Plays a sound through a relay. `wait` uses only the player's interests, as the playback does."""
 
     def __init__(self, relay: Relay | None = None) -> None:
         self.relay: Any = relay
-        #: seconds after which a wait counts as the playback's limit; None if nothing may take so long
+        #: seconds after which a wait reaches the playback's time limit; None if no wait may take so long
         self.limit: float | None = None
 
     def wait(self, player: PulsePlayer) -> None:
-        told = player._clock_report
+        report = player._clock_report
         until, end = player.wake_at(), time.monotonic() + (self.limit or PATIENCE)
-        assert player._clock_report is told or until == 0, "it was told the time, and nobody looks at it"
+        assert player._clock_report is report or until == 0, "a reported time was ignored"
         while time.monotonic() < end:
             now = time.monotonic()
             if now >= until:
                 return
-            own = select.poll()
+            poll = select.poll()
             for descriptor, events in player.interests():
-                own.register(descriptor, events)
-            if own.poll(0):
+                poll.register(descriptor, events)
+            if poll.poll(0):
                 return
             self.pass_on(player, min(until, end) - now)
         if self.limit is not None:
-            raise CannotSpeak(Reason.ENGINE_HUNG, "nothing came any more")
-        raise AssertionError(f"nothing has woken it in {PATIENCE:g} s")
+            raise CannotSpeak(Reason.ENGINE_HUNG, "no further event came")
+        raise AssertionError(f"no event ended the wait within {PATIENCE:g} s")
 
     def pass_on(self, player: PulsePlayer, seconds: float) -> None:
-        """Wait for so long at most, until there is something for the player or the relay, and pass it on."""
+        """Wait for an event of the player or the relay, and pass on the relay's data. `seconds` limits the wait."""
         poll = select.poll()
         for descriptor, events in player.interests():
             poll.register(descriptor, events)
@@ -78,12 +79,12 @@ class Rig:
             poll.poll(max(0.0, seconds) * 1000)
             return
         self.relay.register(poll)
-        # a piece that is left is handed on at once
+        # pass on a remaining piece at once
         poll.poll(0 if self.relay.waiting and self.limit is None else max(0.0, seconds) * 1000)
         self.relay.pump()
 
-    def end(self) -> CannotSpeak | None:
-        """Play the sound by a player of its own and return how that failed; None if it has ended well."""
+    def try_to_play(self) -> CannotSpeak | None:
+        """Play the sound with a new player, and return its error, or None if it succeeded."""
         player = None
         try:
             player = PulsePlayer(RATE)
@@ -116,8 +117,8 @@ class Rig:
 
 
 @pytest.fixture
-def rig(sink: Sink, monkeypatch: pytest.MonkeyPatch) -> MakeRig:
-    """Puts a fresh relay before the sound server."""
+def make_rig(sink: Sink, monkeypatch: pytest.MonkeyPatch) -> MakeRig:
+    """Return a function that starts a new relay for the sound server."""
     for name, value in sink.env.items():
         monkeypatch.setenv(name, value)
 
@@ -131,8 +132,8 @@ def rig(sink: Sink, monkeypatch: pytest.MonkeyPatch) -> MakeRig:
 
 
 @contextmanager
-def answered_between_calls(monkeypatch: pytest.MonkeyPatch, answer: Callable[[], None]) -> Iterator[None]:
-    """Have something happen before every single call of libpulse."""
+def before_each_call(monkeypatch: pytest.MonkeyPatch, action: Callable[[], None]) -> Iterator[None]:
+    """Run an action before each call of libpulse."""
     library = libpulse.load()
 
     class Interposed:
@@ -140,7 +141,7 @@ def answered_between_calls(monkeypatch: pytest.MonkeyPatch, answer: Callable[[],
             function = getattr(library, name)
 
             def call(*arguments: Any) -> Any:
-                answer()
+                action()
                 return function(*arguments)
 
             return call
@@ -151,77 +152,75 @@ def answered_between_calls(monkeypatch: pytest.MonkeyPatch, answer: Callable[[],
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_no_wakeup_is_lost_whenever_the_server_answers(
-    rig: MakeRig, monkeypatch: pytest.MonkeyPatch, seed: int
-) -> None:
+def test_no_wakeup_is_lost_whatever_the_timing(make_rig: MakeRig, monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
     chance = random.Random(seed)
-    with rig() as behind:
-        behind.relay.piece = chance.choice([7, 19, 64, 65536])
+    with make_rig() as rig:
+        rig.relay.piece = chance.choice([7, 19, 64, 65536])
 
-        def answer() -> None:
+        def pump_sometimes() -> None:
             if chance.random() < 0.5:
-                behind.relay.pump()
+                rig.relay.pump()
 
-        with answered_between_calls(monkeypatch, answer):
+        with before_each_call(monkeypatch, pump_sometimes):
             player = PulsePlayer(RATE)
-            began = time.monotonic()
-            behind.play(player)
-            took = time.monotonic() - began
+            started_at = time.monotonic()
+            rig.play(player)
+            took = time.monotonic() - started_at
             assert player.consumed() == len(SOUND)
             player.kill()
     assert SECONDS <= took < SECONDS + 1
 
 
 @pytest.mark.parametrize("number", ERRORS)
-def test_an_error_at_any_step_is_the_end_in_words(rig: MakeRig, number: int) -> None:
-    ends = []
+def test_a_server_error_at_any_step_ends_playback_with_a_reason(make_rig: MakeRig, number: int) -> None:
+    errors = []
     for step in range(8):
-        with rig() as behind:
-            behind.relay.error = (step, number)
-            ends.append(behind.end())
-    # hello and auth, the client's name, the stream; other requests do not matter
-    assert [end is None for end in ends[:3]] == [False] * 3, ends
-    assert {end.reason for end in ends if end is not None} <= {"audio_device", "audio_lost"}
+        with make_rig() as rig:
+            rig.relay.error = (step, number)
+            errors.append(rig.try_to_play())
+    # the first steps are the authentication, the client's name and the stream; errors of later ones may be ignored
+    assert None not in errors[:3], errors
+    assert {error.reason for error in errors if error is not None} <= {"audio_device", "audio_lost"}
 
 
 @pytest.mark.parametrize("hush", [False, True], ids=["cut", "silent"])
-def test_a_connection_that_ends_anywhere_is_the_end_in_words(rig: MakeRig, hush: bool) -> None:
-    with rig() as behind:
-        assert behind.end() is None
-        whole = behind.relay.forwarded
-    for at in range(0, whole // 2, 61):  # how often it tells the time is by chance; in the half of it nothing has ended
-        with rig() as behind:
+def test_a_connection_lost_at_any_byte_ends_playback_with_a_reason(make_rig: MakeRig, hush: bool) -> None:
+    with make_rig() as rig:
+        assert rig.try_to_play() is None
+        whole = rig.relay.forwarded
+    for at in range(0, whole // 2, 61):  # the number of time reports varies, but half the bytes are never enough
+        with make_rig() as rig:
             if hush:
-                behind.relay.silent_at = at
-                behind.limit = 0.05
+                rig.relay.silent_at = at
+                rig.limit = 0.05
             else:
-                behind.relay.cut_at = at
-            end = behind.end()
-            assert end is not None, f"it ended well with {at} of {whole} bytes"
-            assert end.reason in {"audio_device", "audio_lost", "engine_hung"}
+                rig.relay.cut_at = at
+            error = rig.try_to_play()
+            assert error is not None, f"the sound was played with {at} of {whole} bytes"
+            assert error.reason in {"audio_device", "audio_lost", "engine_hung"}
 
 
-def test_a_move_told_together_with_the_end_is_seen(rig: MakeRig, sink: Sink) -> None:
-    """To a dummy, at which nobody has heard it."""
-    with rig() as behind, dummy_of(sink):
+def test_a_move_to_a_dummy_reported_with_the_end_fails_the_sentence(make_rig: MakeRig, sink: Sink) -> None:
+
+    with make_rig() as rig, dummy_of(sink):
         player = PulsePlayer(RATE)
         try:
-            behind.feed(player)
-            behind.relay.silent_at = behind.relay.forwarded
+            rig.feed(player)
+            rig.relay.silent_at = rig.relay.forwarded
             player.close()
-            behind.relay.pump()
-            # the newest: that of a test before this one may not be gone yet
-            streams = [int(each.split("\t")[0]) for each in sink.pactl("list", "short", "sink-inputs").splitlines()]
+            rig.relay.pump()
+            # move the newest stream, because one of the previous test may still exist
+            streams = [int(line.split("\t")[0]) for line in sink.pactl("list", "short", "sink-inputs").splitlines()]
             sink.pactl("move-sink-input", str(max(streams)), DUMMY_SINK)
-            over = time.monotonic() + 2 * SECONDS
-            while (rest := over - time.monotonic()) > 0:
-                waiting = select.poll()
-                behind.relay.register(waiting)
-                waiting.poll(rest * 1000)
-                behind.relay.pump()
-            behind.relay.silent_at = None
+            end = time.monotonic() + 2 * SECONDS
+            while (rest := end - time.monotonic()) > 0:
+                poll = select.poll()
+                rig.relay.register(poll)
+                poll.poll(rest * 1000)
+                rig.relay.pump()
+            rig.relay.silent_at = None
             with pytest.raises(CannotSpeak, match="only a dummy output left") as error:
-                behind.await_end(player)
+                rig.await_end(player)
             assert (error.value.reason, error.value.final) == ("audio_lost", True)
         finally:
             player.kill()
@@ -229,7 +228,7 @@ def test_a_move_told_together_with_the_end_is_seen(rig: MakeRig, sink: Sink) -> 
 
 @contextmanager
 def dummy_of(sink: Sink) -> Iterator[None]:
-    """Have a dummy beside the sink, which stays the default."""
+    """Add a dummy output. The sink remains the default."""
     module = sink.pactl("load-module", "module-null-sink", f"sink_name={DUMMY_SINK}").strip()
     try:
         yield
@@ -237,74 +236,75 @@ def dummy_of(sink: Sink) -> Iterator[None]:
         sink.pactl("unload-module", module)
 
 
-def test_samples_that_wait_after_a_gap_are_not_heard_before_they_are_played(rig: MakeRig) -> None:
-    """It goes on once it has as much as it began with, and its clock with it."""
-    with rig() as behind:
+def test_samples_waiting_after_a_gap_do_not_count_as_heard(make_rig: MakeRig) -> None:
+    """After a gap, the server and its clock continue once the buffer is as full as at the start."""
+    with make_rig() as rig:
         player = PulsePlayer(RATE)
         try:
-            behind.feed(player)
-            assert _heard_in(behind, player, 3 * SECONDS) == len(SOUND)
+            rig.feed(player)
+            assert _heard_in(rig, player, 3 * SECONDS) == len(SOUND)
             assert player.offer(memoryview(SOUND)[:_PIECE]) == _PIECE
-            assert _heard_in(behind, player, SECONDS) == len(SOUND)
-            behind.play(player)
+            assert _heard_in(rig, player, SECONDS) == len(SOUND)
+            rig.play(player)
             assert player.consumed() == 2 * len(SOUND) + _PIECE
         finally:
             player.kill()
 
 
-def _heard_in(behind: Rig, player: PulsePlayer, seconds: float) -> int:
-    """Return the bytes that were heard when these seconds are over; nothing is offered meanwhile."""
+def _heard_in(rig: Rig, player: PulsePlayer, seconds: float) -> int:
+    """Return the number of bytes that have been heard after this time. No samples are offered during it."""
     end = time.monotonic() + seconds
     while (rest := end - time.monotonic()) > 0:
-        behind.pass_on(player, min(rest, 0.01))
+        rig.pass_on(player, min(rest, 0.01))
         player.consumed()
         player.wake_at()
     return player.consumed()
 
 
-def test_a_time_that_is_told_before_it_has_begun_is_none() -> None:
-    """PipeWire answers while no device runs, with the time that the answer took."""
+def test_a_time_reported_before_playback_starts_is_ignored() -> None:
+    """While no device runs, PipeWire reports the time that its reply took."""
     with PipeWire() as server, pytest.MonkeyPatch.context() as patch:
         for name, value in server.env.items():
             patch.setenv(name, value)
         server.load("card")
-        behind = Rig()
+        rig = Rig()
         for _ in range(5):
             player = PulsePlayer(RATE)
             try:
                 while player.device is None:
-                    behind.wait(player)
+                    rig.wait(player)
                 server.freeze("pipewire")
                 player.offer(memoryview(SOUND)[:_PIECE])
-                assert _heard_in(behind, player, 0.1) == 0
+                assert _heard_in(rig, player, 0.1) == 0
                 assert not player.proven
             finally:
                 server.thaw("pipewire")
                 player.kill()
 
 
-@pytest.mark.parametrize("cookie", ["none is asked for", "the right one", "another"])
-def test_a_server_is_reached_over_the_network_by_its_cookie(
+@pytest.mark.parametrize("cookie", ["not required", "right", "wrong"])
+def test_a_network_server_is_reached_with_the_right_cookie(
     sink: Sink, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, cookie: str
 ) -> None:
-    """As by pacat: PULSE_SERVER and PULSE_COOKIE are libpulse's own."""
-    for name in ("wanted", "other"):
+    """libpulse itself reads PULSE_SERVER and PULSE_COOKIE, as for pacat."""
+    for name in ("right", "wrong"):
         (tmp_path / name).write_bytes(name[:1].encode() * 256)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    asked = "auth-anonymous=1" if cookie == "none is asked for" else f"auth-cookie={tmp_path / 'wanted'}"
-    module = sink.pactl("load-module", "module-native-protocol-tcp", "listen=127.0.0.1", f"port={port}", asked)
+    access = "auth-anonymous=1" if cookie == "not required" else f"auth-cookie={tmp_path / 'right'}"
+    module = sink.pactl("load-module", "module-native-protocol-tcp", "listen=127.0.0.1", f"port={port}", access)
     try:
         for name, value in sink.env.items():
             monkeypatch.setenv(name, value)
         monkeypatch.setenv("PULSE_SERVER", f"tcp:127.0.0.1:{port}")
-        monkeypatch.setenv("PULSE_COOKIE", str(tmp_path / ("other" if cookie == "another" else "wanted")))
-        end = Rig().end()
-        if cookie == "another":
-            assert end is not None
-            assert (end.reason, str(end)) == ("audio_device", "the sound server rejected the connection: Access denied")
+        monkeypatch.setenv("PULSE_COOKIE", str(tmp_path / ("wrong" if cookie == "wrong" else "right")))
+        error = Rig().try_to_play()
+        if cookie == "wrong":
+            message = "the sound server rejected the connection: Access denied"
+            assert error is not None
+            assert (error.reason, str(error)) == ("audio_device", message)
         else:
-            assert end is None
+            assert error is None
     finally:
         sink.pactl("unload-module", module.strip())

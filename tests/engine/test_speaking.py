@@ -1,4 +1,4 @@
-"""Tests for an engine process with talk's own driver, from its start to its exit, through the protocol."""
+"""Tests for an engine process with talk's own driver, from its start to its exit, using the protocol."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
+from tests.engine.process import FAST, Engine, SharedEngine
 from tests.engine.programs import NEVER_READS
-from tests.engine.spawned import FAST, Shared, Spawned
 from tests.support.processes import children
 from tests.support.timing import assert_within, limits
 
@@ -36,26 +36,27 @@ _NOT_NEEDED = (
     "socket",
     "logging",
 )
-_TELL = """
+#: Code that writes the names of all imported modules at the exit.
+_REPORT_MODULES = """
 import atexit
 atexit.register(lambda: sys.stderr.write(" ".join(sys.modules)))
 """
 
 
 @pytest.fixture(scope="module")
-def shared() -> Iterator[Shared]:
-    with contextlib.closing(Shared(lambda: Spawned(alive_every=ALIVE_EVERY))) as shared:
+def shared() -> Iterator[SharedEngine]:
+    with contextlib.closing(SharedEngine(lambda: Engine(alive_every=ALIVE_EVERY))) as shared:
         yield shared
 
 
 @pytest.fixture
-def writing(tmp_path: Path) -> Iterator[Spawned]:
-    """Return a process that writes to a file, which takes no time."""
-    with Spawned(f"file:{tmp_path}/x.wav") as engine:
+def file_engine(tmp_path: Path) -> Iterator[Engine]:
+    """Return a process that writes to a file, which is faster than real time."""
+    with Engine(f"file:{tmp_path}/x.wav") as engine:
         yield engine
 
 
-def _length(ended: protocol.Ended) -> float:
+def _duration(ended: protocol.Ended) -> float:
     assert ended.duration is not None, ended
     return ended.duration
 
@@ -63,21 +64,21 @@ def _length(ended: protocol.Ended) -> float:
 # -- the start
 
 
-def test_a_process_gets_ready_and_lists_its_voices() -> None:
-    with Spawned() as engine:
+def test_a_process_becomes_ready_and_lists_its_voices() -> None:
+    with Engine() as engine:
         ready = engine.until(protocol.Ready)
         assert (ready.driver, ready.player) == ("espeak", "null")
         assert ready.version is not None
         assert ready.version.startswith("eSpeak NG ")
         engine.say("yes")
-        told = engine.event()
-        assert isinstance(told, protocol.VoiceList)
-        assert any(voice.language == "en-us" and voice.id == "gmw/en-US" for voice in told.voices)
+        event = engine.event()
+        assert isinstance(event, protocol.VoiceList)
+        assert any(voice.language == "en-us" and voice.id == "gmw/en-US" for voice in event.voices)
         assert isinstance(engine.event(), protocol.Started)
 
 
-def test_voices_that_are_known_are_not_listed() -> None:
-    with Spawned(list_voices=False) as engine:
+def test_voices_that_the_server_knows_are_not_listed() -> None:
+    with Engine(list_voices=False) as engine:
         assert engine.spoken("yes").outcome == protocol.OUTCOME_COMPLETED
         engine.leave()
         assert engine.event() is None
@@ -87,7 +88,7 @@ def test_voices_that_are_known_are_not_listed() -> None:
 @pytest.mark.parametrize("text", ["battery low. Please come home", "..."])
 def test_a_process_imports_nothing_that_it_does_not_need(player: Player, text: str) -> None:
     """Imports delay the next sentence after a crash."""
-    with Spawned(player.plays(), before=_TELL) as engine:
+    with Engine(player.plays(), before=_REPORT_MODULES) as engine:
         engine.spoken(text)
         engine.leave()
         imported = set(engine.errors().split())
@@ -97,35 +98,35 @@ def test_a_process_imports_nothing_that_it_does_not_need(player: Player, text: s
 
 @pytest.mark.parametrize("less", [0, 1 << 20])
 def test_a_process_gets_no_more_than_half_of_the_machines_memory(less: int) -> None:
-    """The limit is at least a billion bytes. A lower limit that is already set remains."""
-    most = max(1 << 30, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2)
-    before = f"import resource\nresource.setrlimit(resource.RLIMIT_DATA, ({most - less}, -1))" if less else ""
-    with Spawned(before=before) as engine:
+    """The limit is at least 1 GiB. A lower limit that is already set remains."""
+    limit = max(1 << 30, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2)
+    before = f"import resource\nresource.setrlimit(resource.RLIMIT_DATA, ({limit - less}, -1))" if less else ""
+    with Engine(before=before) as engine:
         soft, _ = resource.prlimit(engine.process.pid, resource.RLIMIT_DATA)
-    assert soft == most - less
+    assert soft == limit - less
 
 
 # -- sentences
 
 
 @limits()
-def test_words_come_as_they_are_heard_and_only_forward(engine: Spawned) -> None:
+def test_words_are_reported_in_order_when_they_are_heard(engine: Engine) -> None:
     text = "this one é 日本 😀 battery low, please."
-    began, late = time.monotonic(), []
+    started_at, delays = time.monotonic(), []
     engine.say(text)
     while not isinstance(event := engine.event(), protocol.Ended):
         if isinstance(event, protocol.Word):
-            late.append(time.monotonic() - began - event.time)
-    assert _length(event) <= time.monotonic() - began < _length(event) + 0.3
+            delays.append(time.monotonic() - started_at - event.time)
+    assert _duration(event) <= time.monotonic() - started_at < _duration(event) + 0.3
     words = engine.words()
     assert [text[word.start : word.end] for word in words][1:] == ["é", "日本", "😀", "battery", "low", "please"]
     assert [word.number for word in words] == list(range(1, len(words) + 1))
     assert all(first.end <= second.start for first, second in itertools.pairwise(words))
-    assert_within(max(late) - min(late), 0.1, "a word after another")
-    assert min(late) >= 0
+    assert_within(max(delays) - min(delays), 0.1, "a word after another")
+    assert min(delays) >= 0
 
 
-def test_a_goal_in_hand_is_told_to_be_alive(engine: Spawned) -> None:
+def test_signs_of_life_are_sent_while_a_goal_is_spoken(engine: Engine) -> None:
     last = time.monotonic()
     engine.say("a.\n\n\n\na", rate=120)  # the second word comes after some `Alive` messages
     alive = 0
@@ -137,29 +138,29 @@ def test_a_goal_in_hand_is_told_to_be_alive(engine: Spawned) -> None:
     assert alive > 1
 
 
-def test_a_text_without_anything_to_say_ends_with_nothing_to_say(engine: Spawned) -> None:
+def test_a_text_without_words_fails_with_nothing_to_say(engine: Engine) -> None:
     for text in ("", "  \n", "...", "\x01\x02", "«»"):
         ended = engine.spoken(text, f"goal {text!a}")
         assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, "nothing_to_say")
     assert engine.spoken("yes", "g2").outcome == protocol.OUTCOME_COMPLETED
 
 
-def test_control_characters_are_no_commands_and_keep_the_offsets(writing: Spawned) -> None:
-    plain = _length(writing.spoken("a    b one two", "g1"))
-    assert writing.spoken("a \x01\x00\x1bb one two", "g2").outcome == protocol.OUTCOME_COMPLETED
-    assert writing.words("g1")[-1].start == writing.words("g2")[-1].start == len("a    b one ")
-    # libespeak-ng would take 0x01 for a command and speak at 80 words per minute
-    assert _length(writing.spoken("a \x0180Sb one two", "g3")) < plain * 2.5
+def test_control_characters_are_not_commands_and_keep_the_offsets(file_engine: Engine) -> None:
+    plain = _duration(file_engine.spoken("a    b one two", "g1"))
+    assert file_engine.spoken("a \x01\x00\x1bb one two", "g2").outcome == protocol.OUTCOME_COMPLETED
+    assert file_engine.words("g1")[-1].start == file_engine.words("g2")[-1].start == len("a    b one ")
+    # libespeak-ng would read 0x01 and "80S" as the command to speak at 80 words per minute
+    assert _duration(file_engine.spoken("a \x0180Sb one two", "g3")) < plain * 2.5
 
 
-def test_settings_belong_to_their_goal(writing: Spawned) -> None:
+def test_settings_apply_only_to_their_goal(file_engine: Engine) -> None:
     text = "the battery is low, please come home"
-    fast = _length(writing.spoken(text, "g1", rate=400))
-    assert _length(writing.spoken(text, "g2", rate=100, voice="en-us")) > 2 * fast
-    assert abs(_length(writing.spoken(text, "g3", rate=400)) - fast) < 0.15
+    fast = _duration(file_engine.spoken(text, "g1", rate=400))
+    assert _duration(file_engine.spoken(text, "g2", rate=100, voice="en-us")) > 2 * fast
+    assert abs(_duration(file_engine.spoken(text, "g3", rate=400)) - fast) < 0.15
 
 
-def test_an_unknown_voice_fails_with_near_matches_and_the_next_goal_is_spoken(engine: Spawned) -> None:
+def test_an_unknown_voice_fails_one_goal_and_suggests_similar_names(engine: Engine) -> None:
     ended = engine.spoken("yes", voice="en-uss")
     assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, "unknown_voice")
     assert ended.message is not None
@@ -171,7 +172,7 @@ def test_an_unknown_voice_fails_with_near_matches_and_the_next_goal_is_spoken(en
 # -- stops
 
 
-def test_a_stop_for_another_goal_is_ignored(engine: Spawned) -> None:
+def test_a_stop_for_another_goal_is_ignored(engine: Engine) -> None:
     engine.send(protocol.Stop("g0"))
     engine.say("yes")
     engine.until(protocol.Started)
@@ -179,7 +180,7 @@ def test_a_stop_for_another_goal_is_ignored(engine: Spawned) -> None:
     assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
 
 
-def test_a_stop_that_comes_with_the_sentence_is_obeyed(engine: Spawned) -> None:
+def test_a_stop_sent_together_with_the_sentence_is_obeyed(engine: Engine) -> None:
     engine.send(protocol.Speak("g1", "one two three four five", 200, 1.0, None, 50), protocol.Stop("g1"))
     assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_STOPPED
     assert engine.words() == []
@@ -188,36 +189,36 @@ def test_a_stop_that_comes_with_the_sentence_is_obeyed(engine: Spawned) -> None:
 # -- idle, and exit
 
 
-def test_a_crash_leaves_no_core(engine: Spawned) -> None:
+def test_a_crash_leaves_no_core_dump(engine: Engine) -> None:
     soft, _ = resource.prlimit(engine.process.pid, resource.RLIMIT_CORE)
     assert soft in (0, 1)  # bytes; 0 if the hard limit is 0
 
 
-def test_an_idle_process_does_not_wake_up(engine: Spawned) -> None:
+def test_an_idle_process_does_not_wake_up(engine: Engine) -> None:
     assert engine.spoken("a").outcome == protocol.OUTCOME_COMPLETED
-    time.sleep(0.05)  # the process becomes idle, which no event reports
-    before = _switches(engine.process.pid)
+    time.sleep(0.05)  # until the process is idle, which no event reports
+    before = _context_switches(engine.process.pid)
     time.sleep(4 * ALIVE_EVERY)  # the measured time
-    assert _switches(engine.process.pid) == before
+    assert _context_switches(engine.process.pid) == before
 
 
-def _switches(pid: int) -> str:
+def _context_switches(pid: int) -> str:
     with open(f"/proc/{pid}/status") as file:
         return next(line for line in file if line.startswith("voluntary_ctxt_switches"))
 
 
-def test_an_orphan_ends_before_it_starts() -> None:
-    with Spawned(server=1) as engine:
+def test_a_process_without_its_server_exits_at_once() -> None:
+    with Engine(server=1) as engine:
         assert engine.event() is None
         assert engine.process.wait(5) == 0
 
 
-def test_the_process_ends_with_its_server_and_so_does_its_player(player: Player, tmp_path: Path) -> None:
-    begun = tmp_path / "begun"
-    os.mkfifo(begun)
-    with Spawned(player.command(f"open({str(begun)!r}, 'w').close()\n{NEVER_READS}")) as engine:
+def test_the_process_and_its_player_end_with_the_server(player: Player, tmp_path: Path) -> None:
+    started = tmp_path / "started"
+    os.mkfifo(started)
+    with Engine(player.command(f"open({str(started)!r}, 'w').close()\n{NEVER_READS}")) as engine:
         engine.say("one two three")
-        begun.read_text()
+        started.read_text()
         assert len(children(engine.process.pid)) == 1
         engine.hang_up()
         assert engine.all_gone()
@@ -225,7 +226,7 @@ def test_the_process_ends_with_its_server_and_so_does_its_player(player: Player,
 
 
 def test_the_end_of_the_connection_stops_the_sentence_and_ends_the_process() -> None:
-    with Spawned() as engine:
+    with Engine() as engine:
         engine.say("one two three four five", rate=FAST)
         engine.until_word()
         engine.leave()

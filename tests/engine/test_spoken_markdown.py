@@ -11,7 +11,7 @@ import pytest
 from talkcli.engine import protocol
 from talkcli.engine.parent.render import render
 from talkcli.goals.reasons import Reason
-from tests.engine.spawned import FAST, Shared, Spawned
+from tests.engine.process import FAST, Engine, SharedEngine
 from tests.support.real_voice import REAL_VOICE
 
 if TYPE_CHECKING:
@@ -25,13 +25,13 @@ WORDS = ["Battery", "Low", "at", "nine", "See", "the", "charger", "Now"]
 
 
 @pytest.fixture(scope="module")
-def shared() -> Iterator[Shared]:
-    with contextlib.closing(Shared(Spawned)) as shared:
+def shared() -> Iterator[SharedEngine]:
+    with contextlib.closing(SharedEngine(Engine)) as shared:
         yield shared
 
 
 def speak(
-    engine: Spawned, *pieces: str, goal: str = "g1", voice: str | None = None, last: bool = True
+    engine: Engine, *pieces: str, goal: str = "g1", voice: str | None = None, last: bool = True
 ) -> protocol.Ended:
     """Speak a text in Markdown that arrives in pieces, and return how the goal ended."""
     first = protocol.Speak(
@@ -43,37 +43,37 @@ def speak(
     return engine.until(protocol.Ended)
 
 
-def heard(engine: Spawned, text: str, goal: str = "g1") -> list[str]:
+def heard(engine: Engine, text: str, goal: str = "g1") -> list[str]:
     return [text[word.start : word.end] for word in engine.words(goal)]
 
 
-def test_marks_are_not_spoken_and_words_have_the_offsets_of_the_text(engine: Spawned) -> None:
+def test_marks_are_not_spoken_and_words_have_the_offsets_of_the_text(engine: Engine) -> None:
     clean = engine.spoken(CLEAN, "g0", rate=FAST)
     ended = speak(engine, TEXT)
     assert ended.duration == pytest.approx(clean.duration, abs=0.05)
     assert heard(engine, TEXT) == WORDS
 
 
-def test_a_text_that_grows_is_spoken_alike(engine: Spawned) -> None:
+def test_a_text_that_grows_is_spoken_alike(engine: Engine) -> None:
     ended = speak(engine, *TEXT, "")
     assert ended.outcome == protocol.OUTCOME_COMPLETED
     assert heard(engine, TEXT) == WORDS
 
 
-def test_marks_without_text_are_nothing_to_say(engine: Spawned) -> None:
+def test_marks_without_text_are_nothing_to_say(engine: Engine) -> None:
     for goal, pieces in (("g1", ["---"]), ("g2", ["**", "**\n", "---"])):
         ended = speak(engine, *pieces, goal=goal)
         assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, Reason.NOTHING_TO_SAY)
 
 
-def test_an_incomplete_link_of_a_broken_text_is_not_spoken(engine: Spawned) -> None:
+def test_an_incomplete_link_of_a_broken_text_is_not_spoken(engine: Engine) -> None:
     text = ["**One.** Two. ", "See [the docs](http"]
     assert speak(engine, *text, last=False).outcome == protocol.OUTCOME_COMPLETED
     assert heard(engine, "".join(text)) == ["One", "Two"]
 
 
-def test_a_neural_voice_does_not_speak_marks(real: dict[str, str]) -> None:
-    with Spawned(environment=real) as engine:
+def test_a_neural_voice_does_not_speak_marks(real_voice_env: dict[str, str]) -> None:
+    with Engine(environment=real_voice_env) as engine:
         speak(engine, TEXT, voice=REAL_VOICE)
         assert heard(engine, TEXT) == WORDS
 

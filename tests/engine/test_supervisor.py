@@ -1,6 +1,6 @@
 """Tests for the engine thread, with the scripted engine as its process.
 
-Whatever happens to the process, each goal is spoken or ends.
+Whatever happens to the process, every goal ends.
 """
 
 from __future__ import annotations
@@ -37,33 +37,33 @@ from talkcli.engine.parent.supervisor import (
 from talkcli.engine.protocol import KILL_LIMIT_S, OUTCOME_COMPLETED, OUTCOME_FAILED, OUTCOME_STOPPED
 from talkcli.goals.reasons import Reason
 from talkcli.polling import wait_ready
-from tests.engine.threads import CONFIGURE, PATIENCE, Thread, answering
+from tests.engine.threads import CONFIGURE, PATIENCE, EngineThread, python_engine
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from talkcli.engine.parent.supervisor import Report
-    from tests.engine.threads import Start
+    from tests.engine.threads import StartThread
 
 YES = protocol.Speak("g1", "yes", 200, 1.0, None, 50)
 #: The expected end of `YES`.
 SPOKEN = protocol.Ended("g1", OUTCOME_COMPLETED, duration=0.1)
 
 
-def _pauses(thread: Thread) -> int:
-    """Return the number of confirmed holds."""
-    return sum(isinstance(each, protocol.Held) for each in thread.seen)
+def _pauses(thread: EngineThread) -> int:
+    """Return the number of confirmed pauses."""
+    return sum(isinstance(report, protocol.Held) for report in thread.seen)
 
 
-def _hold(thread: Thread, text: str) -> None:
-    """Begin a goal, and request a pause during its first word."""
+def _pause(thread: EngineThread, text: str) -> None:
+    """StartThread a goal, and request a pause during its first word."""
     thread.say(text)
     thread.until(protocol.Word)
     thread.engine.pause("g1", 1)
 
 
-def _process(thread: Thread) -> EngineProcess:
+def _process(thread: EngineThread) -> EngineProcess:
     thread.until(protocol.Ready)
     assert thread.engine._process is not None
     return thread.engine._process
@@ -72,42 +72,42 @@ def _process(thread: Thread) -> EngineProcess:
 # -- pauses
 
 
-def test_a_goal_is_held_beyond_any_limit_and_goes_on_where_it_was(start: Start) -> None:
+def test_a_pause_may_exceed_all_limits_and_resumes_in_place(start: StartThread) -> None:
     thread = start(HANG_LIMIT_S=0.7, HOLD_LIMIT_S=0.7)
-    began = time.monotonic()
-    _hold(thread, "length=0.4 slow-pause=0.1 two three four")
+    started_at = time.monotonic()
+    _pause(thread, "length=0.4 slow-pause=0.1 two three four")
     assert thread.until(protocol.Held).id == "g1"
     assert thread.next(1.0) is None
     thread.engine.resume("g1")
     assert thread.until(protocol.Ended).outcome == OUTCOME_COMPLETED
-    assert time.monotonic() - began >= 0.4 + 1.0
-    assert [each.number for each in thread.seen if isinstance(each, protocol.Word)] == [1, 2, 3, 4, 5]
+    assert time.monotonic() - started_at >= 0.4 + 1.0
+    assert [report.number for report in thread.seen if isinstance(report, protocol.Word)] == [1, 2, 3, 4, 5]
 
 
-def test_a_pause_has_no_limit_once_the_goal_goes_on(start: Start) -> None:
+def test_a_resumed_goal_need_not_confirm_its_pause(start: StartThread) -> None:
     thread = start(HOLD_LIMIT_S=0.2)
-    _hold(thread, "length=0.5 ignore-pause")
+    _pause(thread, "length=0.5 ignore-pause")
     thread.engine.resume("g1")
     assert thread.until(protocol.Ended).outcome == OUTCOME_COMPLETED
     assert not _pauses(thread)
 
 
-def test_a_pause_that_is_not_confirmed_ends_the_process(start: Start) -> None:
+def test_an_unconfirmed_pause_kills_the_process(start: StartThread) -> None:
     thread = start(HOLD_LIMIT_S=0.3)
-    asked = time.monotonic()
-    _hold(thread, "never-ends ignore-pause")
+    started_at = time.monotonic()
+    _pause(thread, "never-ends ignore-pause")
     ended = thread.until(protocol.Ended)
-    assert time.monotonic() - asked >= 0.3
+    assert time.monotonic() - started_at >= 0.3
     assert (ended.reason, ended.message) == ("engine_hung", "the engine did not confirm a pause within 0.3 s")
     assert thread.spoken("yes", "g2").outcome == OUTCOME_COMPLETED
 
 
-def test_paused_is_posted_when_the_process_is_silent_and_not_after_a_resume(start: Start) -> None:
+def test_a_pause_is_reported_at_silence_but_not_after_a_resume(start: StartThread) -> None:
     thread = start()
-    asked = time.monotonic()
-    _hold(thread, "length=0.7 slow-pause=0.3")
+    started_at = time.monotonic()
+    _pause(thread, "length=0.7 slow-pause=0.3")
     thread.until(protocol.Held)
-    assert time.monotonic() - asked >= 0.3
+    assert time.monotonic() - started_at >= 0.3
     thread.engine.resume("g1")
     thread.engine.pause("g1", 2)
     thread.engine.resume("g1")
@@ -115,9 +115,9 @@ def test_paused_is_posted_when_the_process_is_silent_and_not_after_a_resume(star
     assert _pauses(thread) == 1
 
 
-def test_an_answer_to_an_earlier_pause_is_no_answer_to_this_one(start: Start) -> None:
+def test_a_late_confirmation_does_not_count_for_a_new_pause(start: StartThread) -> None:
     thread = start()
-    _hold(thread, "length=0.6 stale-pause slow-pause=0.2")
+    _pause(thread, "length=0.6 stale-pause slow-pause=0.2")
     thread.engine.resume("g1")
     thread.engine.pause("g1", 2)
     assert thread.until(protocol.Held) == protocol.Held("g1", 2)
@@ -126,7 +126,7 @@ def test_an_answer_to_an_earlier_pause_is_no_answer_to_this_one(start: Start) ->
     assert _pauses(thread) == 1
 
 
-def test_a_goal_that_waits_for_a_process_is_held_by_the_thread(start: Start) -> None:
+def test_a_goal_waiting_for_a_process_is_paused_by_the_thread(start: StartThread) -> None:
     thread = start("slow=0.4")
     thread.say("two words")
     thread.engine.pause("g1", 1)
@@ -138,19 +138,19 @@ def test_a_goal_that_waits_for_a_process_is_held_by_the_thread(start: Start) -> 
     assert thread.until(protocol.Ended).outcome == OUTCOME_COMPLETED
 
 
-def test_a_goal_that_is_held_by_the_thread_is_stopped_at_once(start: Start) -> None:
+def test_a_goal_paused_by_the_thread_is_stopped_at_once(start: StartThread) -> None:
     thread = start("slow=0.5")
     thread.say("two words")
     thread.engine.pause("g1", 1)
     thread.engine.stop("g1")
     assert [thread.next(), thread.next()] == [protocol.Held("g1", 1), protocol.Ended("g1", OUTCOME_STOPPED)]
-    assert thread.spoken("the next is not held", "g2") == protocol.Ended("g2", OUTCOME_COMPLETED, duration=0.1)
+    assert thread.spoken("the next is not paused", "g2") == protocol.Ended("g2", OUTCOME_COMPLETED, duration=0.1)
 
 
 @pytest.mark.parametrize("on_stop", ["", "on-stop=crash"])
-def test_a_paused_goal_is_stopped(start: Start, on_stop: str) -> None:
+def test_a_paused_goal_can_be_stopped(start: StartThread, on_stop: str) -> None:
     thread = start()
-    _hold(thread, f"never-ends {on_stop}")
+    _pause(thread, f"never-ends {on_stop}")
     thread.until(protocol.Held)
     thread.engine.stop("g1")
     thread.engine.pause("g1", 1)
@@ -158,16 +158,16 @@ def test_a_paused_goal_is_stopped(start: Start, on_stop: str) -> None:
     assert _pauses(thread) == 1
 
 
-def test_a_crash_before_the_pause_is_confirmed_ends_the_goal(start: Start) -> None:
+def test_a_crash_before_the_pause_is_confirmed_ends_the_goal(start: StartThread) -> None:
     thread = start()
-    _hold(thread, "length=0.2 at=0.9 crash slow-pause=5")
+    _pause(thread, "length=0.2 at=0.9 crash slow-pause=5")
     ended = thread.until(protocol.Ended)
     assert (ended.outcome, ended.reason) == (OUTCOME_FAILED, "engine_crashed")
     thread.engine.resume("g1")
     assert thread.spoken("yes", "g2").outcome == OUTCOME_COMPLETED
 
 
-def test_a_pause_or_resume_of_another_goal_changes_nothing(start: Start) -> None:
+def test_a_pause_or_resume_of_another_goal_changes_nothing(start: StartThread) -> None:
     thread = start()
     thread.engine.pause("g1", 1)
     thread.say("length=0.2")
@@ -181,31 +181,31 @@ def test_a_pause_or_resume_of_another_goal_changes_nothing(start: Start) -> None
 
 
 @pytest.fixture
-def answers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Callable[..., Thread]]:
-    """Return a function that starts an engine thread. The process replies with lines of Python, as in `answering`."""
+def start_python(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Callable[..., EngineThread]]:
+    """Return a function that starts an engine thread with a `python_engine` as its process."""
     with contextlib.ExitStack() as stack:
 
-        def make(*lines: str) -> Thread:
-            monkeypatch.setattr("talkcli.engine.parent.process.engine_command", lambda: answering(tmp_path, *lines))
-            return stack.enter_context(contextlib.closing(Thread()))
+        def make(*lines: str) -> EngineThread:
+            monkeypatch.setattr("talkcli.engine.parent.process.engine_command", lambda: python_engine(tmp_path, *lines))
+            return stack.enter_context(contextlib.closing(EngineThread()))
 
         yield make
 
 
-@pytest.mark.parametrize("followed", [True, False])
-def test_the_process_is_told_whether_a_goal_follows(answers: Callable[..., Thread], followed: bool) -> None:
-    told = (
+@pytest.mark.parametrize("waits", [True, False])
+def test_the_process_learns_whether_another_goal_waits(start_python: Callable[..., EngineThread], waits: bool) -> None:
+    reply = (
         'protocol.Ended(command.id, protocol.OUTCOME_COMPLETED, None, f"{command.next_waits} {command.next_is_neural}")'
     )
-    thread = answers("tell(protocol.Started(command.id))", f"tell({told})")
-    thread.engine.announce_next("g1", followed, next_is_neural=True)  # no process is ready yet
+    thread = start_python("send(protocol.Started(command.id))", f"send({reply})")
+    thread.engine.announce_next("g1", waits, next_is_neural=True)  # no process is ready yet
     thread.until(protocol.Ready)
     thread.say("battery low")
-    thread.engine.announce_next("g1", followed, next_is_neural=True)
-    assert thread.until(protocol.Ended) == protocol.Ended("g1", OUTCOME_COMPLETED, None, f"{followed} True")
+    thread.engine.announce_next("g1", waits, next_is_neural=True)
+    assert thread.until(protocol.Ended) == protocol.Ended("g1", OUTCOME_COMPLETED, None, f"{waits} True")
 
 
-def test_a_process_that_takes_no_goal_is_ended(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_accepts_no_goal_is_replaced(start: StartThread, monkeypatch: pytest.MonkeyPatch) -> None:
     """The next process gets the goal."""
     thread = start()
     monkeypatch.setattr(_process(thread), "send", lambda _: False)
@@ -214,7 +214,7 @@ def test_a_process_that_takes_no_goal_is_ended(start: Start, monkeypatch: pytest
     assert thread.until(protocol.Ended) == SPOKEN
 
 
-def test_a_goal_that_is_sent_to_a_process_in_its_death_is_spoken_by_the_next(start: Start) -> None:
+def test_a_goal_sent_to_a_dying_process_is_spoken_by_the_next(start: StartThread) -> None:
     thread = start()
     thread.until(protocol.Ready)
     for number in range(10):
@@ -225,25 +225,25 @@ def test_a_goal_that_is_sent_to_a_process_in_its_death_is_spoken_by_the_next(sta
         assert ended == protocol.Ended(f"g{number}", OUTCOME_COMPLETED, duration=0.01)
 
 
-def test_a_goal_for_which_two_processes_die_before_they_begin_with_it_ends(start: Start) -> None:
+def test_a_goal_fails_if_two_processes_die_before_starting_it(start: StartThread) -> None:
     thread = start()
     ended = thread.spoken("silent-start length=0 crash")
     assert (ended.outcome, ended.reason) == (OUTCOME_FAILED, "engine_crashed")
-    assert sum(isinstance(each, EngineDied) for each in thread.seen) == 2
+    assert sum(isinstance(report, EngineDied) for report in thread.seen) == 2
     assert thread.spoken("yes", "g2").outcome == OUTCOME_COMPLETED
 
 
-def test_a_process_that_was_given_up_gets_no_other_goal(start: Start) -> None:
+def test_an_abandoned_process_gets_no_other_goal(start: StartThread) -> None:
     thread = start()
     thread.say("never-ends ignore-stop")
     thread.until(protocol.Word)
-    lost = thread.engine._process
+    abandoned = thread.engine._process
     thread.engine.give_up("g1")
     assert thread.spoken("yes", "g2") == protocol.Ended("g2", OUTCOME_COMPLETED, duration=0.1)
-    assert thread.engine._process is not lost
+    assert thread.engine._process is not abandoned
 
 
-def test_a_goal_that_ended_before_it_was_given_up_costs_no_process(start: Start) -> None:
+def test_abandoning_a_goal_that_has_ended_keeps_the_process(start: StartThread) -> None:
     thread = start()
     thread.spoken("length=0")
     process = thread.engine._process
@@ -253,27 +253,27 @@ def test_a_goal_that_ended_before_it_was_given_up_costs_no_process(start: Start)
     assert thread.engine._process is process
 
 
-def test_a_closed_process_takes_no_command(start: Start) -> None:
+def test_a_closed_process_accepts_no_command(start: StartThread) -> None:
     thread = start()
     process = _process(thread)
     thread.close()
     assert not process.send(protocol.Stop("g1"))
 
 
-def test_a_goal_that_is_handed_in_just_before_the_end_ends(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
-    thread, held = start(), threading.Event()
+def test_a_goal_submitted_just_before_the_shutdown_ends(start: StartThread, monkeypatch: pytest.MonkeyPatch) -> None:
+    thread, submitted = start(), threading.Event()
     post = thread.engine._post
 
     def slow(report: Report) -> None:
         post(report)
         if isinstance(report, protocol.Ended) and report.id == "g0":
-            held.wait(PATIENCE)  # the goal and `close` arrive while the thread is busy
+            submitted.wait(PATIENCE)  # the goal and `close` arrive while the thread is busy
 
     monkeypatch.setattr(thread.engine, "_post", slow)
     assert thread.spoken("length=0", "g0").id == "g0"
     thread.say("never-ends")
     thread.engine.close()
-    held.set()
+    submitted.set()
     ended = thread.until(protocol.Ended)
     assert (ended.id, ended.reason) == ("g1", "shutdown")
 
@@ -281,17 +281,17 @@ def test_a_goal_that_is_handed_in_just_before_the_end_ends(start: Start, monkeyp
 # -- the process
 
 
-def test_a_thread_that_stood_still_hears_the_engine_first(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_after_a_suspend_messages_come_before_time_limits(start: StartThread, monkeypatch: pytest.MonkeyPatch) -> None:
     """After the machine or the server was suspended, messages are read before time limits are checked."""
-    standing = [0.7]
+    suspensions = [0.7]
 
     class Clock:
         def __getattr__(self, name: str) -> Any:
             return getattr(time, name)
 
         def monotonic(self) -> float:
-            if words and standing and sys._getframe(1).f_code.co_name == "_run":  # between two rounds of the loop
-                time.sleep(standing.pop())
+            if words and suspensions and sys._getframe(1).f_code.co_name == "_run":  # between two turns of the loop
+                time.sleep(suspensions.pop())
             return time.monotonic()
 
     words: list[protocol.Word] = []
@@ -300,28 +300,28 @@ def test_a_thread_that_stood_still_hears_the_engine_first(start: Start, monkeypa
     thread.say("length=1.1 b c d e f g h i j k")
     words.append(thread.until(protocol.Word))
     assert thread.until(protocol.Ended).outcome == OUTCOME_COMPLETED
-    assert not standing
+    assert not suspensions
 
 
-def test_a_start_that_hangs_is_tried_again_and_fails_a_goal_each_time_after_a_while(
-    start: Start, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_a_hanging_start_is_retried_and_later_fails_one_goal_each_time(
+    start: StartThread, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    behaviour = tmp_path / "start"
-    behaviour.write_text("hang")
-    monkeypatch.setenv("SCRIPTED_START_FILE", str(behaviour))
+    script = tmp_path / "start"
+    script.write_text("hang")
+    monkeypatch.setenv("SCRIPTED_START_FILE", str(script))
     thread = start(START_LIMIT_S=0.3, ENGINE_WAIT_LIMIT_S=0.5, RESTART_DELAYS_S=(0.0,))
-    began = time.monotonic()
-    words = "the engine was not ready within 0.3 s"
-    assert thread.spoken("battery low") == protocol.Ended("g1", OUTCOME_FAILED, Reason.ENGINE_FAILED, words)
-    assert time.monotonic() - began >= 3 * 0.3, "only a start that began after the time of patience costs a goal"
-    assert thread.until(EngineMissing) == EngineMissing(words), "no goal is in hand: who hands them in has to end one"
+    started_at = time.monotonic()
+    message = "the engine was not ready within 0.3 s"
+    assert thread.spoken("battery low") == protocol.Ended("g1", OUTCOME_FAILED, Reason.ENGINE_FAILED, message)
+    assert time.monotonic() - started_at >= 3 * 0.3, "the goal failed before ENGINE_WAIT_LIMIT_S"
+    assert thread.until(EngineMissing) == EngineMissing(message)  # the thread has no goal that it could fail
     thread.say("coming home", "g2")
-    behaviour.write_text("")
+    script.write_text("")
     monkeypatch.setattr(supervisor, "START_LIMIT_S", 10.0)
     assert thread.until(protocol.Ended).outcome == OUTCOME_COMPLETED
 
 
-class Undying:
+class UndyingProcess:
     """A stand-in for a ready process that survives being killed."""
 
     def __init__(self) -> None:
@@ -340,7 +340,7 @@ class Undying:
         os.close(self.liveness)
 
 
-def _watching(process: EngineProcess, posted: list[Report]) -> Supervisor:
+def _make_supervisor(process: EngineProcess, posted: list[Report]) -> Supervisor:
     """Return a supervisor with this process, without running its thread."""
     engine = Supervisor(CONFIGURE, posted.append)
     for descriptor in (process.socket.fileno(), process.liveness):
@@ -351,14 +351,14 @@ def _watching(process: EngineProcess, posted: list[Report]) -> Supervisor:
 
 
 @pytest.mark.parametrize("spoken", [True, False])
-def test_a_process_that_dies_while_idle_was_of_use_if_it_has_spoken(spoken: bool) -> None:
-    process = cast("EngineProcess", Undying())
-    engine = _watching(process, [])
+def test_a_process_that_dies_idle_is_replaced_sooner_if_it_has_spoken(spoken: bool) -> None:
+    process = cast("EngineProcess", UndyingProcess())
+    engine = _make_supervisor(process, [])
     engine._restarts.start_failed(0.0, 0.0, None)
     if spoken:
         engine._goal = SupervisedGoal(YES, sent=True)
         engine._handle_event(process, SPOKEN)
-    engine._handle_event(process, protocol.Alive(""))  # as from a process that loads a voice
+    engine._handle_event(process, protocol.Alive(""))  # as if the process were loading a voice
     before = time.monotonic()
     engine._lose_process("it is killed", Reason.ENGINE_CRASHED)
     assert (engine._restarts.next_start_at - before < RESTART_DELAYS_S[1]) == spoken
@@ -367,26 +367,26 @@ def test_a_process_that_dies_while_idle_was_of_use_if_it_has_spoken(spoken: bool
 
 
 @pytest.mark.parametrize("in_time", [True, False])
-def test_a_goal_ends_once_when_its_process_is_gone_or_should_be(monkeypatch: pytest.MonkeyPatch, in_time: bool) -> None:
+def test_a_goal_ends_once_when_its_process_is_gone_or_overdue(monkeypatch: pytest.MonkeyPatch, in_time: bool) -> None:
     posted: list[Report] = []
-    undying = Undying()
+    undying = UndyingProcess()
     process = cast("EngineProcess", undying)
-    engine = _watching(process, posted)
+    engine = _make_supervisor(process, posted)
     monkeypatch.setattr(engine, "_start_process", lambda: None)
     engine._goal = SupervisedGoal(YES, sent=True, started=True)
     engine._lose_process("it hangs", Reason.ENGINE_HUNG)
     due = engine._dying[process]
     engine._handle_deadlines(due - KILL_LIMIT_S / 2)
-    assert [type(each).__name__ for each in posted] == ["EngineDied"]
+    assert [type(report).__name__ for report in posted] == ["EngineDied"]
     assert undying.kills == 1
     if not in_time:
         engine._handle_deadlines(due)
         assert undying.kills == 2
         engine._handle_deadlines(due + 1)
-        assert undying.kills == 2, "it was overdue once"
+        assert undying.kills == 2, "the overdue process was killed again"
     engine._release_process(process)
     reason = "engine_hung" if in_time else "not_silent"
-    assert [each.reason for each in posted[1:] if isinstance(each, protocol.Ended)] == [reason]
+    assert [report.reason for report in posted[1:] if isinstance(report, protocol.Ended)] == [reason]
     assert len(posted) == 2
     assert not engine._dying
     engine._actions.close()
@@ -394,20 +394,20 @@ def test_a_goal_ends_once_when_its_process_is_gone_or_should_be(monkeypatch: pyt
 
 # -- restarts
 
-LACKING = "no library"
+NO_LIBRARY = "no library"
 
 
-def test_the_wait_grows_with_each_process_that_never_got_ready_or_died_as_soon_as_it_was() -> None:
+def test_the_restart_delay_grows_with_each_failed_start_or_early_death() -> None:
     failing, dying, now = RestartPolicy(100.0), RestartPolicy(100.0), 100.0
-    for wait in (*RESTART_DELAYS_S, RESTART_DELAYS_S[-1], RESTART_DELAYS_S[-1]):
-        failing.start_failed(now, now, LACKING)
+    for delay in (*RESTART_DELAYS_S, RESTART_DELAYS_S[-1], RESTART_DELAYS_S[-1]):
+        failing.start_failed(now, now, NO_LIBRARY)
         dying.process_died(now, age_s=MIN_LIFETIME_S / 2, had_goal=False)
-        assert failing.next_start_at == dying.next_start_at == now + wait
+        assert failing.next_start_at == dying.next_start_at == now + delay
         now = failing.next_start_at
 
 
 @pytest.mark.parametrize(("age", "had_goal"), [(MIN_LIFETIME_S / 2, True), (MIN_LIFETIME_S * 2, False)])
-def test_a_process_that_was_of_use_costs_no_wait_and_resets_it(age: float, had_goal: bool) -> None:
+def test_the_death_of_a_useful_process_resets_the_delay(age: float, had_goal: bool) -> None:
     restarts = RestartPolicy(100.0)
     for _ in range(4):
         restarts.start_failed(100.0, 100.0, None)
@@ -417,18 +417,18 @@ def test_a_process_that_was_of_use_costs_no_wait_and_resets_it(age: float, had_g
     assert restarts.next_start_at == 200.0 + RESTART_DELAYS_S[0]
 
 
-def test_a_cause_that_stays_is_an_error_until_the_next_start_says_otherwise() -> None:
+def test_a_permanent_error_lasts_until_a_start_fails_without_one() -> None:
     restarts = RestartPolicy(100.0)
-    assert not restarts.start_failed(100.0, 100.0, LACKING)
-    assert restarts.permanent_error == LACKING
+    assert not restarts.start_failed(100.0, 100.0, NO_LIBRARY)
+    assert restarts.permanent_error == NO_LIBRARY
     restarts.permanent_error = None
     restarts.process_died(200.0, age_s=MIN_LIFETIME_S * 2, had_goal=False)
-    restarts.start_failed(200.0, 200.0, LACKING)
-    assert restarts.start_failed(200.0 + WAITED, 200.0 + WAITED, None), "goals wait again, and not for ever"
+    restarts.start_failed(200.0, 200.0, NO_LIBRARY)
+    assert restarts.start_failed(200.0 + WAITED, 200.0 + WAITED, None)  # goals wait again, but not forever
     assert restarts.permanent_error is None
 
 
-def test_a_start_costs_a_goal_only_if_it_began_long_after_there_was_a_process() -> None:
+def test_a_failed_start_fails_a_goal_only_long_after_the_last_process() -> None:
     restarts = RestartPolicy(100.0)
     assert not restarts.start_failed(100.0 + WAITED + 5, 100.0 + WAITED - 0.1, None)
     assert restarts.start_failed(100.0 + WAITED, 100.0 + WAITED, None)
@@ -441,8 +441,8 @@ def test_a_start_costs_a_goal_only_if_it_began_long_after_there_was_a_process() 
 # -- standard error of the process
 
 
-def _complaining(script: str) -> tuple[list[str], str]:
-    """Run a script as the engine process. Return its reported lines of standard error and how it exited."""
+def _run_process(script: str) -> tuple[list[str], str]:
+    """Run a script as the engine process, and return its lines of standard error and a description of its exit."""
     lines: list[str] = []
     command = [sys.executable, "-c", f"import os\n{script}"]
     with pytest.MonkeyPatch.context() as patch:
@@ -450,87 +450,84 @@ def _complaining(script: str) -> tuple[list[str], str]:
         process = EngineProcess(CONFIGURE, lines.append)
     while process.stderr in wait_ready({process.stderr: select.POLLIN}, 20.0) and process.read_stderr():
         pass
-    words = process.describe_exit()
+    exit_message = process.describe_exit()
     process.close()
-    return lines, words
+    return lines, exit_message
 
 
-def test_lines_are_passed_on_when_they_are_whole_and_the_last_is_a_crashs_own() -> None:
-    lines, words = _complaining("for each in (b'one\\ntw', b'o\\n\\n  \\n thr\\xffee'): os.write(2, each)")
+def test_complete_lines_are_reported_and_the_last_one_explains_the_exit() -> None:
+    lines, exit_message = _run_process("for data in (b'one\\ntw', b'o\\n\\n  \\n thr\\xffee'): os.write(2, data)")
     assert lines == ["one", "two", " thr\ufffdee"]
-    assert words == "it exited with status 0 (thr\ufffdee)"
-    assert _complaining("for _ in range(100): os.write(2, b'x' * 65536)")[0] == ["x" * MAX_STDERR_LINE_BYTES], (
-        "one that never ends"
-    )
+    assert exit_message == "it exited with status 0 (thr\ufffdee)"
+    endless_line = "for _ in range(100): os.write(2, b'x' * 65536)"
+    assert _run_process(endless_line)[0] == ["x" * MAX_STDERR_LINE_BYTES]
 
 
-def test_lines_that_are_too_many_are_counted_and_told_with_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
-    passed: list[Report] = []
-    engine, now = Supervisor(CONFIGURE, passed.append), 1000.0
+def test_omitted_lines_are_counted_and_reported_with_the_next_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    posted: list[Report] = []
+    engine, now = Supervisor(CONFIGURE, posted.append), 1000.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
     for number in range(100):
         now = 1000.0 + number / 10
         engine._report_stderr("x")
-    assert passed == [EngineSaid("x")] * MAX_STDERR_LINES
-    for later in (STDERR_PERIOD_S - 0.1, STDERR_PERIOD_S, 2 * STDERR_PERIOD_S):
-        now = 1000.0 + later
-        engine._report_stderr(f"{later}")
-    told = [
-        f"({100 + 1 - MAX_STDERR_LINES} lines were omitted)",
-        f"{STDERR_PERIOD_S}",
-        f"{2 * STDERR_PERIOD_S}",
-    ]
-    assert passed[MAX_STDERR_LINES:] == [EngineSaid(each) for each in told]
+    assert posted == [EngineSaid("x")] * MAX_STDERR_LINES
+    for seconds in (STDERR_PERIOD_S - 0.1, STDERR_PERIOD_S, 2 * STDERR_PERIOD_S):
+        now = 1000.0 + seconds
+        engine._report_stderr(f"{seconds}")
+    omitted = f"({100 + 1 - MAX_STDERR_LINES} lines were omitted)"
+    expected = [omitted, f"{STDERR_PERIOD_S}", f"{2 * STDERR_PERIOD_S}"]
+    assert posted[MAX_STDERR_LINES:] == [EngineSaid(line) for line in expected]
     engine._actions.close()
 
 
-def test_standard_error_is_posted_and_a_traceback_before_the_crash(answers: Callable[..., Thread]) -> None:
+def test_standard_error_is_reported_with_the_traceback_of_a_crash(start_python: Callable[..., EngineThread]) -> None:
     complains = """
 for word in command.text.split():
     if word == "raise":
         raise ValueError("no tongue")
     sys.stderr.write(word + "\\n")
 sys.stderr.flush()
-tell(protocol.Ended(command.id, protocol.OUTCOME_COMPLETED))
+send(protocol.Ended(command.id, protocol.OUTCOME_COMPLETED))
 """
-    thread = answers(complains)
+    thread = start_python(complains)
     thread.say("one two")
-    while sum(isinstance(each, EngineSaid) for each in thread.seen) < 2:
+    while sum(isinstance(report, EngineSaid) for report in thread.seen) < 2:
         assert thread.next() is not None
     thread.say("raise", "g2")
     died = thread.until(EngineDied)
     assert died.message == "the engine crashed: it exited with status 1 (ValueError: no tongue)"
-    said = [each.line for each in thread.seen if isinstance(each, EngineSaid)]
-    assert said[:3] == ["one", "two", "Traceback (most recent call last):"]
-    assert said[-1] == "ValueError: no tongue"
+    lines = [report.line for report in thread.seen if isinstance(report, EngineSaid)]
+    assert lines[:3] == ["one", "two", "Traceback (most recent call last):"]
+    assert lines[-1] == "ValueError: no tongue"
 
 
 # -- the queue of actions
 
 
-def test_nothing_is_lost_and_nothing_overtakes_if_several_threads_hand_in() -> None:
+def test_actions_of_several_threads_are_neither_lost_nor_reordered() -> None:
     queue, done = ActionQueue(), list[tuple[int, int]]()
     count = 1000
 
-    def hand_in(who: int) -> None:
+    def submit(sender: int) -> None:
         for number in range(count):
-            queue.call(lambda number=number: done.append((who, number)))  # type: ignore[misc]
+            queue.call(lambda number=number: done.append((sender, number)))  # type: ignore[misc]
 
-    threads = [threading.Thread(target=hand_in, args=(who,)) for who in range(3)]
-    for each in threads:
-        each.start()
+    threads = [threading.Thread(target=submit, args=(sender,)) for sender in range(3)]
+    for thread in threads:
+        thread.start()
     while len(done) < 3 * count:
         assert wait_ready({queue.fileno(): select.POLLIN}, PATIENCE)
         queue.run()
-    for each in threads:
-        each.join(PATIENCE)
-    assert [[number for who, number in done if who == each] for each in range(3)] == [list(range(count))] * 3
+    for thread in threads:
+        thread.join(PATIENCE)
+    for sender in range(3):
+        assert [number for source, number in done if source == sender] == [*range(count)]
     queue.close()
 
 
-def test_a_queue_takes_any_number_of_actions_and_those_that_come_after_its_end() -> None:
+def test_a_queue_takes_any_number_of_actions_and_ignores_later_ones() -> None:
     queue, done = ActionQueue(), list[int]()
-    for number in range(100_000):  # more than there is room for bytes that wake the thread
+    for number in range(100_000):  # more than the pipe that wakes the thread can hold
         queue.call(lambda number=number: done.append(number))  # type: ignore[misc]
     queue.run()
     assert done == list(range(100_000))

@@ -1,7 +1,7 @@
-"""The contract of synthesizers: each sentence of `synthesizers.base.Synthesizer`, for each synthesizer.
+"""Tests that every synthesizer behaves as `synthesizers.base.Synthesizer` describes.
 
-A new synthesizer is put through it by a row of `SYNTHESIZERS`. The scripted one keeps the suite to the contract: what
-it does is all that is asked for.
+To test a new synthesizer, add it to `SYNTHESIZERS`. The scripted one does only the minimum, which shows that the tests
+don't ask for more than the contract does.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from talkcli.engine.child.synthesizers.base import SampleSink, Synthesizer
 
 TEXT = "battery low, please come home"
-#: Texts of all kinds.
+#: Various texts.
 TEXTS = [
     TEXT,
     "a",
@@ -48,23 +48,23 @@ TEXTS = [
     "one\x01two\x00three\ttab\nline\r\n\x7f \ud800 \ufffd \u200d",
     "word " * 200,
 ]
-#: Texts in which there is nothing to be spoken.
+#: Texts without any words.
 SILENT = ["", " ", "\n\t ", "...", "\x00"]
-#: Seconds by which two renderings of a text may differ: libespeak-ng's noise moves what follows by some samples, and
-#: after another script the pause at its first comma is 44 ms longer.
+#: Seconds by which two renderings of a text may differ. libespeak-ng's noise moves the next sounds by some samples, and
+#: after a text in another script, the pause at the first comma is 44 ms longer.
 NEAR = 0.05
-#: Seconds from the return of an output that raised to that of `speak`.
+#: Seconds within which `speak` returns after its output has raised an error.
 AT_ONCE = 0.05
-#: Seconds in which a voice is loaded.
+#: Seconds within which a voice is loaded.
 LOADED = 0.5
-#: Seconds after which nothing more is to be expected.
+#: Seconds after which a wait fails.
 LATE = 20.0
-#: Seconds of sound that are written at once, at most: they are heard while the rest is made.
-MOST_AT_ONCE = 0.2
+#: The most seconds of sound in one call of `write`, so that speech starts while the rest is still being made.
+MAX_WRITE_S = 0.2
 
 
 class Scripted:
-    """A tone for each word, as long as the word is: the least that is a synthesizer."""
+    """The simplest possible synthesizer. It makes a tone for each letter."""
 
     version: str | None = None
     _RATE = 16000
@@ -76,8 +76,8 @@ class Scripted:
         return (Voice("one", "en", "One"), Voice("two", None, "Two"))
 
     def load(self, voice: str) -> None:
-        if voice not in {each.id for each in self.voices()}:
-            raise UnknownVoice("there is no such thing")
+        if voice not in {known.id for known in self.voices()}:
+            raise UnknownVoice("unknown voice")
         self.voice = voice
 
     def speak(self, text: str, sound: SpeechSettings, output: SampleSink) -> None:
@@ -91,19 +91,19 @@ class Scripted:
             output.word(start, len(word), samples / self._RATE)
             loud, period = int(9000 * sound.volume), (150 if self.voice == "one" else 90) - sound.pitch
             for _ in word:
-                tone = [loud if each % period < period / 2 else -loud for each in range(800 * 200 // sound.rate)]
+                tone = [loud if index % period < period / 2 else -loud for index in range(800 * 200 // sound.rate)]
                 output.write(array("h", tone).tobytes())
                 samples += len(tone)
 
 
 @cache
 def _espeak() -> Espeak:
-    """Return the only one of this process: its library can be loaded once, and hangs if it is to end."""
+    """Return the only instance in this process. Its library can be loaded only once, and can't be unloaded."""
     return Espeak()
 
 
 def _piper(voice: str = "piper/tiny") -> Synthesizer:
-    """Return a synthesizer with this voice; "tiny" hums, in some milliseconds."""
+    """Return a synthesizer with this neural voice. "tiny" hums, and takes only some milliseconds."""
     needs_packages(*NEURAL_PACKAGES)
     synthesizer = Piper(_espeak())
     synthesizer.load(voice)
@@ -111,12 +111,12 @@ def _piper(voice: str = "piper/tiny") -> Synthesizer:
 
 
 def _joe() -> Synthesizer:
-    """Return a synthesizer with a real voice, without its noise."""
+    """Return a synthesizer with a real neural voice, without noise."""
     link_without_noise(real_voice(), Path(os.environ["TALK_VOICES"]))
     return _piper(f"piper/{real_voice().stem}")
 
 
-def _choice() -> Synthesizer:
+def _combined() -> Synthesizer:
     needs_packages(*NEURAL_PACKAGES)
     return CombinedSynthesizer(_espeak())
 
@@ -126,61 +126,60 @@ SYNTHESIZERS: dict[str, Callable[[], Synthesizer]] = {
     "scripted": Scripted,
     "piper": _piper,
     "joe": _joe,
-    "choice": _choice,
+    "combined": _combined,
 }
-#: Those that take half a minute, as they compute.
+#: Synthesizers whose tests take half a minute.
 SLOW = {"joe"}
-#: Those that have no pitch but their own.
+#: Synthesizers whose pitch can't be changed.
 UNPITCHED = {"piper", "joe"}
 
 
 @pytest.fixture(scope="module", autouse=True)
 def voices(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Put two tiny neural voices where voices are found."""
-    place = tmp_path_factory.mktemp("voices")
-    tiny_voice.put(place, "tiny")
-    tiny_voice.put(place, "wee", tiny_voice.model(period=60))
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setenv("TALK_VOICES", str(place))
-        patched.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+    """Install two tiny neural voices."""
+    folder = tmp_path_factory.mktemp("voices")
+    tiny_voice.put(folder, "tiny")
+    tiny_voice.put(folder, "wee", tiny_voice.model(period=60))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TALK_VOICES", str(folder))
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         yield
 
 
 @pytest.fixture(
-    params=[pytest.param(each, marks=pytest.mark.slow if each in SLOW else ()) for each in SYNTHESIZERS],
+    params=[pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in SYNTHESIZERS],
     scope="module",
 )
-def made(request: pytest.FixtureRequest) -> tuple[Synthesizer, str]:
-    """Return one for all tests, as a process has one, and its own voice."""
+def shared_synthesizer(request: pytest.FixtureRequest) -> tuple[Synthesizer, str]:
+    """Return a synthesizer and its default voice. All tests share it, because a process has only one."""
     synthesizer = SYNTHESIZERS[request.param]()
     return synthesizer, synthesizer.voice
 
 
 @pytest.fixture
 def pitched(request: pytest.FixtureRequest) -> bool:
-    """Whether it can be higher or lower."""
-    return request.node.callspec.params["made"] not in UNPITCHED
+    """Return whether the synthesizer can change its pitch."""
+    return request.node.callspec.params["shared_synthesizer"] not in UNPITCHED
 
 
 @pytest.fixture
-def synthesizer(made: tuple[Synthesizer, str]) -> Iterator[Synthesizer]:
-    synthesizer, own = made
+def synthesizer(shared_synthesizer: tuple[Synthesizer, str]) -> Iterator[Synthesizer]:
+    synthesizer, default_voice = shared_synthesizer
     yield synthesizer
-    synthesizer.load(own)
+    synthesizer.load(default_voice)
 
 
 class Tape:
-    """An output that keeps all, checks the order of its calls, and raises an error if it is told to."""
+    """A sink that records everything, and checks the order of the calls. It can raise an error."""
 
-    def __init__(self, *, fails: Exception | None = None, at: str = "", after: int = 0) -> None:
-        """`at`: the method that raises, `after` how many calls of it."""
+    def __init__(self, *, error: Exception | None = None, at: str = "", after: int = 0) -> None:
+        """Set the error that the method named `at` raises after the given number of calls."""
         self.rate = 0
         self.words: list[tuple[int, int, float]] = []
         self.samples = bytearray()
-        #: the longest that was written at once, in seconds
-        self.most = 0.0
+        self.longest_write_s = 0.0
         self.failed_at: float | None = None
-        self._fails, self._at, self._left = fails, at, after
+        self._error, self._at, self._calls_left = error, at, after
         self._thread = threading.get_ident()
 
     @property
@@ -193,40 +192,40 @@ class Tape:
 
     def begin(self, rate: int, voice: str, fallback_reason: str | None = None) -> None:
         self._called("begin")
-        assert not [*self.words, *self.samples], "the rate comes first"
+        assert not [*self.words, *self.samples], "begin was called after word or write"
         assert rate > 0
         assert voice
-        assert fallback_reason is None, "the voice that was asked for speaks"
+        assert fallback_reason is None, "another voice speaks"
         self.rate = rate
 
     def word(self, start: int, length: int, position: float) -> None:
         self._called("word")
-        assert self.rate, "the rate comes first"
+        assert self.rate, "word was called before begin"
         assert length > 0
         assert position >= 0
-        assert round(position * self.rate) >= len(self.samples) // SAMPLE_BYTES, "a word comes before its samples"
-        assert not self.words or position >= self.words[-1][2], "positions never decrease"
+        assert round(position * self.rate) >= len(self.samples) // SAMPLE_BYTES, "a word came after its samples"
+        assert not self.words or position >= self.words[-1][2], "the position decreased"
         self.words.append((start, length, position))
 
     def write(self, samples: bytes) -> None:
         self._called("write")
-        assert self.rate, "the rate comes first"
-        assert len(samples) % SAMPLE_BYTES == 0, "samples are whole"
+        assert self.rate, "write was called before begin"
+        assert len(samples) % SAMPLE_BYTES == 0, "a sample is incomplete"
         self.samples += samples
-        self.most = max(self.most, len(samples) / SAMPLE_BYTES / self.rate)
+        self.longest_write_s = max(self.longest_write_s, len(samples) / SAMPLE_BYTES / self.rate)
 
     def wait(self, descriptor: int) -> None:
         self._called("wait")
-        assert select.select([descriptor], [], [], LATE)[0], "what was waited for doesn't come"
+        assert select.select([descriptor], [], [], LATE)[0], "the descriptor never became readable"
 
     def _called(self, method: str) -> None:
-        assert threading.get_ident() == self._thread, "another thread"
-        assert self.failed_at is None, "it has raised"
-        if self._fails is not None and method == self._at:
-            self._left -= 1
-            if self._left < 0:
+        assert threading.get_ident() == self._thread, "the call came from another thread"
+        assert self.failed_at is None, "the call came after an error"
+        if self._error is not None and method == self._at:
+            self._calls_left -= 1
+            if self._calls_left < 0:
                 self.failed_at = time.monotonic()
-                raise self._fails
+                raise self._error
 
 
 def _spoken(synthesizer: Synthesizer, text: str = TEXT, sound: SpeechSettings | None = None) -> Tape:
@@ -236,61 +235,59 @@ def _spoken(synthesizer: Synthesizer, text: str = TEXT, sound: SpeechSettings | 
 
 
 def _assert_alike(first: Tape, second: Tape) -> None:
-    """Assert that two are the same sentence, but for noise."""
+    """Assert that two tapes have the same sentence, except for noise."""
     assert first.rate == second.rate
     assert first.seconds == pytest.approx(second.seconds, abs=NEAR)
-    assert [each[:2] for each in first.words] == [each[:2] for each in second.words]
-    assert [each[2] for each in first.words] == pytest.approx([each[2] for each in second.words], abs=NEAR)
+    assert [word[:2] for word in first.words] == [word[:2] for word in second.words]
+    assert [word[2] for word in first.words] == pytest.approx([word[2] for word in second.words], abs=NEAR)
     assert first.loudest == pytest.approx(second.loudest, rel=0.2)
 
 
 # -- voices
 
 
-def _plain(synthesizer: Synthesizer) -> list[str]:
-    """Return the ids of voices but for variants, and for the real voice unless it is in force: its load takes long."""
-    found = [each.id for each in synthesizer.voices() if not each.id.startswith("+")]
-    return [each for each in found if each != REAL_VOICE or each == synthesizer.voice]
+def _plain_ids(synthesizer: Synthesizer) -> list[str]:
+    """Return the ids of all voices except variants. The slow real voice is only included if it is the current one."""
+    ids = [voice.id for voice in synthesizer.voices() if not voice.id.startswith("+")]
+    return [voice for voice in ids if voice != REAL_VOICE or voice == synthesizer.voice]
 
 
-def test_voices_have_ids_and_one_of_them_is_in_force(
-    made: tuple[Synthesizer, str],
-) -> None:
-    synthesizer, own = made
+def test_voices_have_unique_ids_and_include_the_current_one(shared_synthesizer: tuple[Synthesizer, str]) -> None:
+    synthesizer, default_voice = shared_synthesizer
     voices = synthesizer.voices()
-    ids = {each.id for each in voices}
+    ids = {voice.id for voice in voices}
     assert len(ids) == len(voices)
-    assert own in ids
-    assert all(each.id and each.name and each.language != "" for each in voices)
+    assert default_voice in ids
+    assert all(voice.id and voice.name and voice.language != "" for voice in voices)
     assert synthesizer.voices() == voices
 
 
 @limits()
-def test_each_voice_is_loaded_soon_by_its_id_with_a_variant_or_without(synthesizer: Synthesizer) -> None:
-    """Of the many that libespeak-ng has, some do: `test_voices.py` loads and speaks with all of them."""
-    plain = _plain(synthesizer)
-    variants = [each.id for each in synthesizer.voices() if each.id.startswith("+")]
-    few = len(plain) // 10 + 1
-    for voice in [*plain[::few], *(plain[0] + each for each in variants[::20])]:
-        began = time.monotonic()
+def test_a_voice_is_loaded_quickly_with_or_without_a_variant(synthesizer: Synthesizer) -> None:
+    """libespeak-ng has many voices, so this test loads only some. `test_voices.py` speaks with all of them."""
+    plain = _plain_ids(synthesizer)
+    variants = [voice.id for voice in synthesizer.voices() if voice.id.startswith("+")]
+    step = len(plain) // 10 + 1
+    for voice in [*plain[::step], *(plain[0] + variant for variant in variants[::20])]:
+        started_at = time.monotonic()
         synthesizer.load(voice)
-        assert_within(time.monotonic() - began, LOADED, voice)
+        assert_within(time.monotonic() - started_at, LOADED, voice)
         assert synthesizer.voice == voice
         _spoken(synthesizer, "a")
 
 
-def test_the_voice_is_the_one_that_was_loaded_last(made: tuple[Synthesizer, str], synthesizer: Synthesizer) -> None:
+def test_the_last_loaded_voice_speaks(shared_synthesizer: tuple[Synthesizer, str], synthesizer: Synthesizer) -> None:
     before = _spoken(synthesizer)
-    other = next(each for each in reversed(_plain(synthesizer)) if each != made[1])
+    other = next(voice for voice in reversed(_plain_ids(synthesizer)) if voice != shared_synthesizer[1])
     synthesizer.load(other)
     after = _spoken(synthesizer)
     assert after.samples != before.samples
-    synthesizer.load(made[1])
+    synthesizer.load(shared_synthesizer[1])
     _assert_alike(_spoken(synthesizer), before)
 
 
 @pytest.mark.parametrize("voice", ["no such voice", "", "no/such+voice", "\ud800"])
-def test_a_voice_that_cannot_be_had_leaves_the_one_before(synthesizer: Synthesizer, voice: str) -> None:
+def test_an_unknown_voice_leaves_the_current_one_unchanged(synthesizer: Synthesizer, voice: str) -> None:
     before, spoken = synthesizer.voice, _spoken(synthesizer, sound=SpeechSettings(rate=300))
     with pytest.raises(UnknownVoice) as caught:
         synthesizer.load(voice)
@@ -303,14 +300,12 @@ def test_a_voice_that_cannot_be_had_leaves_the_one_before(synthesizer: Synthesiz
 
 
 @pytest.mark.parametrize("text", [*TEXTS, *SILENT], ids=range(len(TEXTS) + len(SILENT)))
-def test_any_text_is_spoken_with_its_words_if_it_has_any_and_nothing_of_it_stays(
-    synthesizer: Synthesizer, pitched: bool, text: str
-) -> None:
-    """The tape holds the order: the rate, then words before their samples, at positions that never decrease."""
-    alone = _spoken(synthesizer)
+def test_any_text_is_spoken_without_affecting_the_next_one(synthesizer: Synthesizer, pitched: bool, text: str) -> None:
+    """`Tape` checks the order of the calls."""
+    before = _spoken(synthesizer)
     tape = _spoken(synthesizer, text, SpeechSettings(rate=450, volume=0.1, pitch=99 if pitched else 50))
     assert tape.rate
-    assert tape.most < MOST_AT_ONCE, "the first samples are written while the rest is made"
+    assert tape.longest_write_s < MAX_WRITE_S
     if text in SILENT:
         assert tape.words == []
         assert tape.loudest == 0
@@ -319,23 +314,23 @@ def test_any_text_is_spoken_with_its_words_if_it_has_any_and_nothing_of_it_stays
         assert all(0 <= start < len(text) for start, _, _ in tape.words)
         assert tape.words[-1][2] < tape.seconds
         assert tape.loudest > 0
-    _assert_alike(_spoken(synthesizer), alone)
+    _assert_alike(_spoken(synthesizer), before)
 
 
-def test_the_words_of_a_sentence_are_told_with_their_places_in_the_text(synthesizer: Synthesizer) -> None:
+def test_words_are_reported_with_their_positions_in_the_text(synthesizer: Synthesizer) -> None:
     tape = _spoken(synthesizer)
     words = [TEXT[start : start + length].strip(",") for start, length, _ in tape.words]
     assert words == TEXT.replace(",", "").split()
 
 
-def test_rate_volume_and_pitch_of_a_sentence_are_obeyed_or_refused(synthesizer: Synthesizer, pitched: bool) -> None:
+def test_rate_volume_and_pitch_are_obeyed_or_refused(synthesizer: Synthesizer, pitched: bool) -> None:
     usual = _spoken(synthesizer)
     assert _spoken(synthesizer, sound=SpeechSettings(rate=400)).seconds < 0.8 * usual.seconds
     assert _spoken(synthesizer, sound=SpeechSettings(rate=100)).seconds > 1.3 * usual.seconds
     assert 0 < _spoken(synthesizer, sound=SpeechSettings(volume=0.5)).loudest < 0.7 * usual.loudest
     assert _spoken(synthesizer, sound=SpeechSettings(volume=0.0)).loudest == 0
     if pitched:
-        high, low = (_spoken(synthesizer, sound=SpeechSettings(pitch=each)).samples for each in (90, 10))
+        high, low = (_spoken(synthesizer, sound=SpeechSettings(pitch=pitch)).samples for pitch in (90, 10))
         assert high != low
     else:
         tape = Tape()
@@ -346,44 +341,44 @@ def test_rate_volume_and_pitch_of_a_sentence_are_obeyed_or_refused(synthesizer: 
     _assert_alike(_spoken(synthesizer), usual)
 
 
-def test_libespeak_speaks_on_as_before_after_it_was_asked_how_another_language_sounds() -> None:
+def test_phonemes_of_another_language_do_not_change_espeaks_voice() -> None:
     espeak = _espeak()
-    own = espeak.voice
+    default_voice = espeak.voice
     try:
         espeak.load("gmw/de")
         before = _spoken(espeak, "zwanzig Züge", SpeechSettings(rate=300))
-        with espeak.phonemizer("en-us") as speller:
-            assert speller.word_positions("twenty trains") == [(0, 6), (7, 6)]
+        with espeak.phonemizer("en-us") as phonemizer:
+            assert phonemizer.word_positions("twenty trains") == [(0, 6), (7, 6)]
         _assert_alike(_spoken(espeak, "zwanzig Züge", SpeechSettings(rate=300)), before)
     finally:
-        espeak.load(own)
+        espeak.load(default_voice)
 
 
-def test_the_end_of_a_spelling_waits_for_nothing_and_the_next_sentence_for_the_library() -> None:
+def test_closing_a_phonemizer_does_not_wait_but_the_next_sentence_does() -> None:
     espeak = _espeak()
     before, tape = _spoken(espeak), Tape()
-    asked, go = threading.Event(), threading.Event()
+    called, may_return = threading.Event(), threading.Event()
     order: list[str] = []
 
-    def held(*arguments: object) -> object:
-        asked.set()
-        go.wait(LATE)
-        said = library(*arguments)
+    def slow(*arguments: object) -> object:
+        called.set()
+        may_return.wait(LATE)
+        phonemes = to_phonemes(*arguments)
         order.append("returned")
-        return said
+        return phonemes
 
-    def spell() -> None:
+    def phonemize() -> None:
         with pytest.raises(Stopped):
-            speller.clauses("hello")
+            phonemizer.clauses("hello")
         order.append("stopped")
 
-    with espeak.phonemizer("de") as speller:
-        library, speller._to_phonemes = speller._to_phonemes, held
-        thread = threading.Thread(target=spell)
+    with espeak.phonemizer("de") as phonemizer:
+        to_phonemes, phonemizer._to_phonemes = phonemizer._to_phonemes, slow
+        thread = threading.Thread(target=phonemize)
         thread.start()
-        assert asked.wait(LATE)
+        assert called.wait(LATE)
     assert not order
-    threading.Timer(0.1, go.set).start()
+    threading.Timer(0.1, may_return.set).start()
     espeak.speak(TEXT, SpeechSettings(), tape)
     assert order[0] == "returned"
     thread.join(LATE)
@@ -401,11 +396,10 @@ def test_the_end_of_a_spelling_waits_for_nothing_and_the_next_sentence_for_the_l
     ],
 )
 def test_a_sentence_ends_where_libespeak_makes_a_pause(language: str, text: str, ends: list[str]) -> None:
-    with _espeak().phonemizer(language) as speller:
-        found = list(split_text(speller, text))
-    starts = [each.words[0][1] for each in found]
-    sentences = [text[begin:end].rstrip() for begin, end in zip(starts, [*starts[1:], None], strict=True)]
-    assert [each.endswith(end) for each, end in zip(sentences, ends, strict=True)] == [True] * len(ends)
+    with _espeak().phonemizer(language) as phonemizer:
+        starts = [sentence.words[0][1] for sentence in split_text(phonemizer, text)]
+    sentences = [text[start:end].rstrip() for start, end in zip(starts, [*starts[1:], None], strict=True)]
+    assert all(sentence.endswith(end) for sentence, end in zip(sentences, ends, strict=True)), sentences
 
 
 # -- the output
@@ -413,7 +407,7 @@ def test_a_sentence_ends_where_libespeak_makes_a_pause(language: str, text: str,
 
 @limits()
 @pytest.mark.parametrize(
-    ("at", "after", "fails"),
+    ("at", "after", "error"),
     [
         ("begin", 0, Stopped()),
         ("word", 0, CannotSpeak(Reason.AUDIO_LOST, "unplugged")),
@@ -422,21 +416,21 @@ def test_a_sentence_ends_where_libespeak_makes_a_pause(language: str, text: str,
         ("write", 5, Stopped()),
     ],
 )
-def test_an_error_of_the_output_comes_out_at_once_and_the_output_is_left_alone(
-    synthesizer: Synthesizer, at: str, after: int, fails: Exception
+def test_an_error_of_the_output_is_raised_at_once_without_further_calls(
+    synthesizer: Synthesizer, at: str, after: int, error: Exception
 ) -> None:
-    alone = _spoken(synthesizer)
-    tape = Tape(fails=fails, at=at, after=after)
-    with pytest.raises(type(fails)) as caught:
+    before = _spoken(synthesizer)
+    tape = Tape(error=error, at=at, after=after)
+    with pytest.raises(type(error)) as caught:
         synthesizer.speak("word " * 1000, SpeechSettings(), tape)
-    assert caught.value is fails
+    assert caught.value is error
     assert tape.failed_at is not None
     assert_within(time.monotonic() - tape.failed_at, AT_ONCE, "the end of a sentence that was stopped")
-    _assert_alike(_spoken(synthesizer), alone)
+    _assert_alike(_spoken(synthesizer), before)
 
 
-def test_an_output_that_takes_its_time_is_waited_for(synthesizer: Synthesizer) -> None:
-    """As long as it has not returned, nothing more comes: that is how a sentence is held."""
+def test_a_synthesizer_waits_for_a_slow_output(synthesizer: Synthesizer) -> None:
+    """A sink pauses the sentence by not returning from a call."""
     inside = False
 
     class Slow(Tape):

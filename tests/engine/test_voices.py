@@ -1,4 +1,4 @@
-"""Voices: the library sets every voice that is found, however it is written. A goal's voice is that goal's alone."""
+"""Tests for voices: finding them by name, suggesting similar names, and setting the voice of one goal."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from talkcli.engine import protocol
 from talkcli.engine.child.synthesizers import espeak
 from talkcli.engine.protocol import Voice
 from talkcli.engine.voices import find_voice, list_voices, matching_languages, unknown_voice_message
-from tests.engine.spawned import USUAL, Spawned
+from tests.engine.process import USUAL, Engine
 from tests.support.reference import Sentence, render
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-#: Sets each voice by its id in the library itself and says which one it has then.
+#: A program that sets each voice by its id in the library, and prints the library's current voice.
 SET_ALL = """
 import json, sys
 sys.path[:] = json.loads(sys.argv[1])
 from talkcli.engine.child.synthesizers.espeak import load_library
 espeak, *_ = load_library()
 current = []
-for each in json.load(sys.stdin):
-    status = espeak.SetVoiceByName(each.encode())
+for voice in json.load(sys.stdin):
+    status = espeak.SetVoiceByName(voice.encode())
     current.append([status, espeak.GetCurrentVoice().contents.identifier.decode()])
 json.dump(current, sys.stdout)
 """
@@ -46,47 +46,48 @@ NEURAL = (
 
 @cache
 def listed() -> tuple[Voice, ...]:
-    """Return espeak's voices; the installed neural ones stand behind them."""
-    with Spawned() as engine:
+    """Return espeak's voices. They must be listed before the installed neural voices."""
+    with Engine() as engine:
         voices = engine.until(protocol.VoiceList).voices
-    own = tuple(each for each in voices if not each.id.startswith("piper/"))
-    assert voices[: len(own)] == own
-    return own
+    espeak_voices = tuple(voice for voice in voices if not voice.id.startswith("piper/"))
+    assert voices[: len(espeak_voices)] == espeak_voices
+    return espeak_voices
 
 
 def plain() -> list[Voice]:
-    return [each for each in listed() if not each.id.startswith("+")]
+    """Return espeak's voices without the variants."""
+    return [voice for voice in listed() if not voice.id.startswith("+")]
 
 
-def found(wanted: str, preferred: str | None = None) -> str | None:
-    """Return the id of the voice that is found among all."""
-    result = find_voice(wanted, (*listed(), *NEURAL), preferred)
-    return result.id if result else None
+def find_id(wanted: str, preferred: str | None = None) -> str | None:
+    """Return the id of the voice that is found among espeak's and the neural voices."""
+    voice = find_voice(wanted, (*listed(), *NEURAL), preferred)
+    return voice.id if voice else None
 
 
-# -- espeak's
+# -- espeak's voices
 
 
 def test_the_variants_are_listed_after_the_voices() -> None:
     assert len(plain()) > 100
-    variants = [each for each in listed() if each.id.startswith("+")]
+    variants = [voice for voice in listed() if voice.id.startswith("+")]
     assert [*plain(), *variants] == list(listed())
     assert Voice("+f3", None, "variant female3") in variants
 
 
-def test_every_word_of_every_voice_is_found_whatever_its_case() -> None:
+def test_every_voice_is_found_by_each_of_its_names_in_any_case() -> None:
     for voice in listed():
-        for word in (voice.id, voice.name, voice.id.rpartition("/")[2], voice.language):
-            for each in (word, word.upper(), word.lower()) if word else ():
-                found = find_voice(each, listed())
-                assert found is not None, each
-                assert word == voice.language or found.id.endswith(voice.id), (each, found)
-                assert word != voice.language or found.language == voice.language, (each, found)
+        for name in (voice.id, voice.name, voice.id.rpartition("/")[2], voice.language):
+            for spelling in (name, name.upper(), name.lower()) if name else ():
+                match = find_voice(spelling, listed())
+                assert match is not None, spelling
+                assert name == voice.language or match.id.endswith(voice.id), (spelling, match)
+                assert name != voice.language or match.language == voice.language, (spelling, match)
 
 
-def test_the_library_sets_every_voice_that_is_found() -> None:
-    wanted = [each.id for each in listed()] + [f"{voice.id}+Andy" for voice in plain()]
-    ids = [each.id for each in (find_voice(each, listed()) for each in wanted) if each is not None]
+def test_the_library_accepts_every_voice_that_is_found() -> None:
+    wanted = [voice.id for voice in listed()] + [f"{voice.id}+Andy" for voice in plain()]
+    ids = [voice.id for voice in (find_voice(name, listed()) for name in wanted) if voice is not None]
     assert len(ids) == len(wanted)
     done = subprocess.run(
         [sys.executable, "-c", SET_ALL, json.dumps(sys.path)],
@@ -96,22 +97,22 @@ def test_the_library_sets_every_voice_that_is_found() -> None:
         timeout=60,
         check=True,
     )
-    assert json.loads(done.stdout) == [[0, each] for each in ids]
+    assert json.loads(done.stdout) == [[0, voice] for voice in ids]
 
 
-def test_every_voice_can_be_spoken_with_under_each_of_its_words(tmp_path: Path) -> None:
-    with Spawned(f"file:{tmp_path / 'x.wav'}") as engine:
-        words = [word for voice in plain() for word in (voice.id, voice.name, voice.language) if word]
-        for number, word in enumerate(words):
-            ended = engine.spoken("a", f"g{number}", voice=word, rate=450)
-            # In the wheel's library one voice has nothing for this text.
-            assert ended.outcome == protocol.OUTCOME_COMPLETED or ended.reason == "nothing_to_say", (word, ended)
+def test_every_voice_can_speak_under_each_of_its_names(tmp_path: Path) -> None:
+    with Engine(f"file:{tmp_path / 'x.wav'}") as engine:
+        names = [name for voice in plain() for name in (voice.id, voice.name, voice.language) if name]
+        for number, name in enumerate(names):
+            ended = engine.spoken("a", f"g{number}", voice=name, rate=450)
+            # In the wheel's library, one voice makes no sound from this text.
+            assert ended.outcome == protocol.OUTCOME_COMPLETED or ended.reason == "nothing_to_say", (name, ended)
 
 
 # -- by the names that people type
 
-#: Those that mean one of espeak's voices.
-ESPEAKS = {
+#: Ids of espeak's voices, and names that mean them.
+ESPEAK_NAMES = {
     "gmw/en": ["en-gb", "EN", "english"],
     "gmw/en+f3": ["en+f3", "en-GB+F3", "+f3", "variant female3", "English+f3"],
     "gmw/en+m2": ["en+2"],
@@ -132,8 +133,8 @@ ESPEAKS = {
     "sit/cmn": ["mandarin"],
     "gmq/nb": ["norwegian"],
 }
-#: … that mean a neural one.
-NEURALS = {
+#: Ids of neural voices, and names that mean them.
+NEURAL_NAMES = {
     "piper/en_US-joe-medium": [
         *("piper/en_US-joe-medium", "Piper/EN_us-Joe", "piper/en", "piper/en-US_JOE", "joe", "piper/joe"),
         *("en_US-joe-medium", "EN_us-joe"),
@@ -145,11 +146,11 @@ NEURALS = {
     "piper/xx_XX-only": ["only"],
     "piper/own-voice": ["own"],
 }
-#: … and that mean none, or several.
-NOBODYS = [
+#: Names that mean no voice, or several.
+UNCLEAR_NAMES = [
     *("piper/de", "piper/", "piper/en#", "piper/en+f3", "xx-xx", "zh-CN", "de-DE+nosuch", "chinese", "joe#", "joe+f3"),
     *("jo", "en_US-amy-medium", "eva", "medium", "voice"),
-    # The library would refuse these, or pass over them.
+    # The library would refuse these, or ignore a part of them.
     *("", "+", "en+", "en+nosuch", "en+f3+f2", "en+female3", "en+99", "+99", "f3", "../lang/gmw/en", "!v/f3"),
     "nosuch+f3",
 ]
@@ -158,15 +159,15 @@ NOBODYS = [
 @pytest.mark.parametrize(
     ("wanted", "expected"),
     [
-        *((each, voice) for voice, words in {**ESPEAKS, **NEURALS}.items() for each in words),
-        *((each, None) for each in NOBODYS),
+        *((name, voice) for voice, names in {**ESPEAK_NAMES, **NEURAL_NAMES}.items() for name in names),
+        *((name, None) for name in UNCLEAR_NAMES),
     ],
 )
 def test_a_voice_is_found_by_the_names_that_people_type(wanted: str, expected: str | None) -> None:
-    assert found(wanted) == expected
+    assert find_id(wanted) == expected
     if expected is None or not expected.startswith("piper/"):
-        alone = find_voice(wanted, listed())
-        assert (alone.id if alone else None) == expected, "the same if no neural voice is there"
+        voice = find_voice(wanted, listed())
+        assert (voice.id if voice else None) == expected, "without neural voices, another voice is found"
 
 
 @pytest.mark.parametrize(
@@ -193,10 +194,10 @@ def test_a_voice_is_found_by_the_names_that_people_type(wanted: str, expected: s
     ],
 )
 def test_a_language_means_the_servers_neural_voice(wanted: str, preferred: str, expected: str | None) -> None:
-    assert found(wanted, preferred) == expected
+    assert find_id(wanted, preferred) == expected
 
 
-def test_a_voice_without_a_language_is_no_languages() -> None:
+def test_a_voice_without_a_language_matches_no_language() -> None:
     voices = (*listed(), Voice("piper/broken", None, "broken"))
     assert find_voice("", voices, "piper/broken") is None
 
@@ -216,15 +217,15 @@ def test_a_voice_without_a_language_is_no_languages() -> None:
         ("", set()),
     ],
 )
-def test_the_languages_that_a_code_or_an_english_name_means(wanted: str, expected: set[str]) -> None:
+def test_a_code_or_an_english_name_matches_its_languages(wanted: str, expected: set[str]) -> None:
     assert matching_languages(wanted, (*listed(), *NEURAL)) == expected
 
 
-# -- words about the others
+# -- errors for other names
 
 
 @pytest.mark.parametrize(
-    ("wanted", "words"),
+    ("wanted", "message"),
     [
         ("piper/de", 'the voice "piper/de" could be piper/de_DE-eva-low or piper/de_DE-eva; write the whole name'),
         ("eva#2", 'the voice "eva#2" could be piper/de_DE-eva-low#2 or piper/de_DE-eva#2; write the whole name'),
@@ -241,12 +242,12 @@ def test_the_languages_that_a_code_or_an_english_name_means(wanted: str, expecte
         ("joe+f3", "unknown voice \"joe+f3\"; did you mean 'joe'?"),
     ],
 )
-def test_a_voice_that_is_not_found_says_which_ones_it_could_be(wanted: str, words: str) -> None:
-    assert unknown_voice_message(wanted, (*listed(), *NEURAL)).startswith(words)
+def test_the_error_for_an_unclear_voice_lists_the_possible_ones(wanted: str, message: str) -> None:
+    assert unknown_voice_message(wanted, (*listed(), *NEURAL)).startswith(message)
 
 
 @pytest.mark.parametrize(
-    ("wanted", "near"),
+    ("wanted", "suggestion"),
     [
         ("en-uss", "en-us"),
         ("germna", "German"),
@@ -259,35 +260,33 @@ def test_a_voice_that_is_not_found_says_which_ones_it_could_be(wanted: str, word
         ("germna+f3", "German"),
     ],
 )
-def test_an_unknown_voice_is_told_what_comes_near(wanted: str, near: str) -> None:
-    told = unknown_voice_message(wanted, listed())
-    assert told.startswith(f'unknown voice "{wanted}"; did you mean ')
-    assert told.endswith("? list all voices with: talk voices")
-    assert told.count(" or ") < 3
-    assert repr(near) in told
+def test_similar_names_are_suggested_for_an_unknown_voice(wanted: str, suggestion: str) -> None:
+    message = unknown_voice_message(wanted, listed())
+    assert message.startswith(f'unknown voice "{wanted}"; did you mean ')
+    assert message.endswith("? list all voices with: talk voices")
+    assert message.count(" or ") < 3
+    assert repr(suggestion) in message
 
 
-def test_a_word_of_any_length_is_answered_shortly() -> None:
+def test_a_very_long_name_gets_a_short_error() -> None:
     for wanted in ("x" * 60_000, "en-us+" + "y" * 60_000):
         assert find_voice(wanted, listed()) is None
         assert len(unknown_voice_message(wanted, listed())) < 200
 
 
-# -- other drivers'
+# -- voices of other drivers
 
 
-def test_of_another_driver_and_another_system_no_neural_voice_is_proposed(monkeypatch: pytest.MonkeyPatch) -> None:
-    told = unknown_voice_message("piper/en", (*listed(), *NEURAL), "dummy")
-    assert told == '"piper/en" is a neural voice, which the driver "dummy" does not support; leave out --driver'
+def test_neural_voices_are_not_suggested_for_other_drivers_or_systems(monkeypatch: pytest.MonkeyPatch) -> None:
+    message = unknown_voice_message("piper/en", (*listed(), *NEURAL), "dummy")
+    assert message == '"piper/en" is a neural voice, which the driver "dummy" does not support; leave out --driver'
     monkeypatch.setattr(sys, "platform", "darwin")
-    told = unknown_voice_message("piper/en", (), "nsss")
-    assert (
-        told == '"piper/en" is a neural voice, which talk only supports on Linux; list other voices with: talk voices'
-    )
+    expected = '"piper/en" is a neural voice, which talk only supports on Linux; list other voices with: talk voices'
+    assert unknown_voice_message("piper/en", (), "nsss") == expected
     assert "unknown voice" in unknown_voice_message("anna", (), "nsss")
 
 
-def test_the_voices_of_another_driver_may_be_called_after_persons_and_with_a_plus() -> None:
+def test_voices_of_other_drivers_may_have_a_plus_in_their_names() -> None:
     voices = (Voice("com.apple.Alex", "en_US", "Alex"), Voice("com.apple.Daniel", "en_GB", "Daniel+"))
     assert "did you mean 'Daniel+'" in unknown_voice_message("Danel", voices)
     assert "en_GB" not in unknown_voice_message("Danel", voices)
@@ -298,12 +297,12 @@ def test_the_voices_of_another_driver_may_be_called_after_persons_and_with_a_plu
 @pytest.mark.parametrize(
     ("languages", "language"), [(["en-US", "en-GB"], "en-US"), ([b"\x05en-us"], "en-us"), ([None], None), ([], None)]
 )
-def test_a_language_is_listed_however_another_driver_tells_it(languages: list[object], language: str | None) -> None:
+def test_a_language_is_listed_in_any_form_that_drivers_use(languages: list[object], language: str | None) -> None:
     engine = SimpleNamespace(getProperty=lambda _: [SimpleNamespace(id="a", name="Anna", languages=languages)])
     assert list_voices(engine) == (Voice("a", language, "Anna"),)
 
 
-def test_mbrolas_voices_are_listed_if_they_are_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mbrola_voices_are_listed_if_they_are_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     known = [Voice("mb/mb-de4-en", "en", "german-mbrola-4-en"), Voice("mb/mb-us1", "en-us", "us-mbrola-1")]
     monkeypatch.setattr(espeak, "_list_voices", lambda *_: known)
     monkeypatch.setattr(espeak, "_MBROLA_PATHS", (f"{tmp_path}/{{0}}/{{0}}",))
@@ -316,27 +315,27 @@ def test_mbrolas_voices_are_listed_if_they_are_installed(tmp_path: Path, monkeyp
     assert espeak._list_mbrola_voices(None) == [Voice("mb/mb-us1", "en-us", "us-mbrola-1")]
 
 
-# -- a goal's own
+# -- the voice of a goal
 
 
-def test_after_a_goals_own_or_an_unknown_voice_the_default_sounds_as_before(tmp_path: Path) -> None:
-    """As the library's own, which sets everything anew for each sentence; some voices leave their speed behind."""
+def test_a_goals_voice_does_not_change_how_the_default_sounds(tmp_path: Path) -> None:
+    """Some voices change the library's speed, so the reference sets all parameters again for each sentence."""
     target = tmp_path / "x.wav"
     unknown = ["nosuch", "nosuch", "en-us+nosuch", "mb-us1"]
     order = [None, *unknown, None, "zle/be", None, "piqd", None, "en+fast", *unknown, None, "en-us+whisper", None]
     durations, sentences = [], []
-    with Spawned(f"file:{target}") as engine:
+    with Engine(f"file:{target}") as engine:
         for number, voice in enumerate(order):
             ended = engine.spoken(TEXT, f"g{number}", rate=USUAL, voice=voice)
             if voice in unknown:
                 assert ended.reason == "unknown_voice"
                 continue
-            own = find_voice(voice or "gmw/en", listed())
-            assert own is not None
-            sentences.append(Sentence(TEXT, voice=own.id))
+            match = find_voice(voice or "gmw/en", listed())
+            assert match is not None
+            sentences.append(Sentence(TEXT, voice=match.id))
             if voice is None:
                 durations.append(ended.duration)
     with wave.open(str(target)) as file:
         samples = file.readframes(file.getnframes())
-    assert samples == b"".join(each.tobytes() for each in render(sentences))
+    assert samples == b"".join(sentence.tobytes() for sentence in render(sentences))
     assert durations == [pytest.approx(durations[0], abs=0.05)] * 6

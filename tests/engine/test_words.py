@@ -1,4 +1,4 @@
-"""Tests for the words that are found in libespeak-ng's events, and for the clock that computes when they are heard."""
+"""Tests for finding words in libespeak-ng's events, and for the clock that computes when they are heard."""
 
 from __future__ import annotations
 
@@ -20,28 +20,29 @@ if TYPE_CHECKING:
 
 
 def on_32_bits(kind: type) -> type:
-    """Return a C type with the layout of a 32-bit system, which has pointers of 4 bytes."""
+    """Return a C type with the layout of a 32-bit system, whose pointers have 4 bytes."""
     if not issubclass(kind, (ctypes.Structure, ctypes.Union)):
         return ctypes.c_uint32 if kind in (ctypes.c_char_p, ctypes.c_void_p) else kind
-    fields = [(each[0], on_32_bits(each[1])) for each in kind._fields_]
+    fields = [(field[0], on_32_bits(field[1])) for field in kind._fields_]
     return type(kind.__name__, kind.__bases__, {"_fields_": fields})
 
 
-def test_an_event_has_the_size_of_the_librarys_with_pointers_of_4_and_8_bytes() -> None:
-    """Compare with espeak_EVENT in speak_lib.h. If ours is shorter, all but the first word of a callback are lost."""
-    sizes = [ctypes.sizeof(each) for each in (on_32_bits(espeak._EspeakEvent), espeak._EspeakEvent)]
+def test_an_event_has_the_librarys_size_with_4_and_8_byte_pointers() -> None:
+    """If the size differed from that of espeak_EVENT, all but the first word of a callback would be lost."""
+    sizes = [ctypes.sizeof(kind) for kind in (on_32_bits(espeak._EspeakEvent), espeak._EspeakEvent)]
     assert sizes == [36, 40 if ctypes.sizeof(ctypes.c_void_p) == 8 else 36]
 
 
-def reported(text: str, places: Iterable[tuple[int, int]]) -> list[str]:
-    words = WordFinder(text)
-    found = [each for each in (words.find(start, length) for start, length in places) if each is not None]
-    assert [number for _, _, number in found] == list(range(1, len(found) + 1))
-    assert all(end <= start for (_, end, _), (start, _, _) in itertools.pairwise(found))
-    return [text[start:end] for start, end, _ in found]
+def find_words(text: str, positions: Iterable[tuple[int, int]]) -> list[str]:
+    """Return the words that are found for these positions and lengths."""
+    finder = WordFinder(text)
+    words = [word for word in (finder.find(start, length) for start, length in positions) if word is not None]
+    assert [number for _, _, number in words] == list(range(1, len(words) + 1))
+    assert all(end <= start for (_, end, _), (start, _, _) in itertools.pairwise(words))
+    return [text[start:end] for start, end, _ in words]
 
 
-#: Languages, sentences, and the words that are reported for them.
+#: Voices, sentences, and the words that are reported for them.
 SENTENCES = [
     ("gmw/en", "battery low, please!", "battery low please"),
     ("gmw/en", "is in the kitchen", "is in kitchen"),
@@ -67,41 +68,41 @@ SENTENCES = [
 
 
 @pytest.mark.parametrize("number", range(len(SENTENCES)))
-def test_the_words_of_a_sentence_are_those_that_libespeak_itself_tells(number: int) -> None:
-    """All are rendered in one process, whose words are the same each time."""
+def test_the_words_of_a_sentence_are_found_in_libespeaks_events(number: int) -> None:
+    """All sentences are rendered together by one process, and the result is cached."""
     _, text, words = SENTENCES[number]
     rendering = render_with_words([Sentence(text, voice=voice) for voice, text, _ in SENTENCES])[number]
-    places = ((start, end - start or count_letters(text, start)) for start, end, _ in rendering.words)
-    assert reported(text, [(start, length) for start, length in places if length > 0]) == words.split()
+    positions = ((start, end - start or count_letters(text, start)) for start, end, _ in rendering.words)
+    assert find_words(text, [(start, length) for start, length in positions if length > 0]) == words.split()
 
 
-def test_a_word_without_a_length_goes_as_far_as_its_letters() -> None:
-    assert [count_letters("«né» 日本e\u0301", place) for place in range(-1, 11)] == [0, 0, 2, 1, 0, 0, 4, 3, 2, 1, 0, 0]
+def test_a_word_without_a_length_extends_over_its_letters() -> None:
+    assert [count_letters("«né» 日本e\u0301", start) for start in range(-1, 11)] == [0, 0, 2, 1, 0, 0, 4, 3, 2, 1, 0, 0]
 
 
-def test_a_place_that_is_repeated_behind_or_outside_is_none() -> None:
+def test_repeated_backward_and_outside_positions_are_ignored() -> None:
     text = "this one é 日本 😀 ! battery"
-    places = [(0, 4), (0, 4), (5, 0), (9, 1), (-1, 0), (-1, 5), (11, 2), (11, 2), (3, 2), (13, 1), (14, 1), (18, 99)]
-    assert reported(text, places) == ["this", "é", "日本", "😀", "battery"]
-    assert reported("a", [(5, 3), (1, 1), (0, 50)]) == ["a"]
+    positions = [(0, 4), (0, 4), (5, 0), (9, 1), (-1, 0), (-1, 5), (11, 2), (11, 2), (3, 2), (13, 1), (14, 1), (18, 99)]
+    assert find_words(text, positions) == ["this", "é", "日本", "😀", "battery"]
+    assert find_words("a", [(5, 3), (1, 1), (0, 50)]) == ["a"]
 
 
 @given(st.text(max_size=40), st.lists(st.tuples(st.integers(-3, 45), st.integers(-1, 10)), max_size=30))
-def test_words_go_forward_within_the_text_whatever_is_reported(text: str, places: list[tuple[int, int]]) -> None:
-    words = WordFinder(text)
+def test_words_stay_in_order_and_inside_the_text_for_any_positions(text: str, positions: list[tuple[int, int]]) -> None:
+    finder = WordFinder(text)
     end = 0
-    for location, length in places:
-        found = words.find(location, length)
-        if found is not None:
-            before, (start, end, _) = end, found
-            assert before <= start < end <= len(text)
+    for position, length in positions:
+        word = finder.find(position, length)
+        if word is not None:
+            last_end, (start, end, _) = end, word
+            assert last_end <= start < end <= len(text)
             assert text[start:end].split() == [text[start:end]]
 
 
 # -- the word clock
 
 
-def test_the_clock_stands_until_it_is_started_and_is_held_back_by_the_player() -> None:
+def test_the_clock_waits_for_its_start_and_for_the_player() -> None:
     clock = WordClock()
     first, second = TimedWord(0, 1, 0.0), TimedWord(2, 1, 0.5)
     clock.add(first)
@@ -121,7 +122,7 @@ def test_the_clock_stands_until_it_is_started_and_is_held_back_by_the_player() -
     assert clock.pop_started(200.0) == []
 
 
-def test_silence_in_the_stream_moves_the_words_after_it_and_is_not_heard() -> None:
+def test_inserted_silence_delays_later_words_and_does_not_count_as_heard() -> None:
     clock = WordClock()
     before, at, after = TimedWord(0, 1, 0.4), TimedWord(2, 1, 0.5), TimedWord(4, 1, 1.0)
     clock.reset(0.0)
@@ -144,7 +145,7 @@ def test_silence_in_the_stream_moves_the_words_after_it_and_is_not_heard() -> No
     assert clock.next_word_at() == pytest.approx(103.25)
 
 
-def test_another_stream_begins_where_the_audio_goes_on() -> None:
+def test_a_new_stream_starts_at_its_position_in_the_sentence() -> None:
     clock = WordClock()
     missed, word = TimedWord(0, 1, 1.0), TimedWord(2, 1, 2.5)
     clock.start(100.0)
@@ -161,7 +162,7 @@ def test_another_stream_begins_where_the_audio_goes_on() -> None:
     assert clock.heard_position(200.5) == pytest.approx(2.25)
 
 
-def test_the_outputs_own_clock_stands_until_something_is_heard() -> None:
+def test_the_outputs_clock_starts_with_the_first_sound() -> None:
     clock = WordClock()
     clock.add(TimedWord(0, 1, 0.5))
     clock.start(100.0)
@@ -172,9 +173,9 @@ def test_the_outputs_own_clock_stands_until_something_is_heard() -> None:
     assert clock.next_word_at() == pytest.approx(100.8)
 
 
-def test_words_in_zeros_that_are_left_out_begin_with_the_sound() -> None:
+def test_words_in_skipped_silence_start_with_the_sound() -> None:
     clock = WordClock()
     for position in (0.0, 0.2):
         clock.add(TimedWord(0, 1, position))
     clock.skip_until(0.1)
-    assert [each.position for each in clock.pop_all()] == [0.1, 0.2]
+    assert [word.position for word in clock.pop_all()] == [0.1, 0.2]

@@ -1,4 +1,4 @@
-"""A running engine thread for tests, with the reports that it has posted."""
+"""An engine thread for tests, which collects the reports that it posts."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ if TYPE_CHECKING:
 
 _R = TypeVar("_R")
 
-#: Time in seconds after which a report is late even on a busy machine.
+#: Seconds after which a report is late even on a busy machine.
 PATIENCE = 20.0
 CONFIGURE = protocol.Configure(os.getpid(), None, None, None, None)
-#: An engine process that is ready at once. `say` and `other` are its code for a goal and for any other command.
-_ANSWERS = """
+#: An engine process that is ready at once. `say` is its code for a goal, and `other` its code for any other command.
+_PYTHON_ENGINE = """
 import os, sys
 sys.path.insert(0, {root!r})
 from talkcli.engine import protocol
-def tell(*events):
+def send(*events):
     os.write(0, b"".join(map(protocol.encode, events)))
 for line in os.fdopen(0, "rb"):
     command = protocol.decode(line, protocol.COMMAND_CLASSES)
     if isinstance(command, protocol.Configure):
-        tell(protocol.Ready("answers", None, None))
+        send(protocol.Ready("answers", None, None))
     elif isinstance(command, protocol.Speak):
         {say}
     else:
@@ -41,16 +41,16 @@ for line in os.fdopen(0, "rb"):
 """
 
 
-def answering(folder: Path, say: str, other: str = "pass") -> list[str]:
-    """Return the command line of an engine process that replies with these lines of Python."""
+def python_engine(folder: Path, say: str, other: str = "pass") -> list[str]:
+    """Return the command line of an engine process that runs these lines of Python for each command."""
     program = folder / "engine.py"
     root = os.path.dirname(os.path.dirname(talkcli.__file__))
-    program.write_text(_ANSWERS.format(root=root, say=say.replace("\n", "\n        "), other=other))
+    program.write_text(_PYTHON_ENGINE.format(root=root, say=say.replace("\n", "\n        "), other=other))
     return [sys.executable, str(program)]
 
 
-class Thread:
-    """A running engine thread and its reports."""
+class EngineThread:
+    """A running engine thread, with the reports that it has posted."""
 
     def __init__(self) -> None:
         self.seen: list[Report] = []
@@ -75,7 +75,7 @@ class Thread:
         raise AssertionError(f"no {kind.__name__} in {self.seen}")
 
     def spoken(self, text: str, goal: str = "g1") -> protocol.Ended:
-        """Speak a text, and return its end."""
+        """Speak a text, and return the event of its end."""
         self.say(text, goal)
         return self.until(protocol.Ended)
 
@@ -84,14 +84,14 @@ class Thread:
         self.engine.thread.join(PATIENCE)
 
 
-class Start(Protocol):
-    """A function that starts an engine thread, which is closed at the end of the test."""
+class StartThread(Protocol):
+    """A function that starts an engine thread. The thread is closed after the test."""
 
-    def __call__(self, begins: str = "", **limits: Any) -> Thread:
-        """Start an engine thread.
+    def __call__(self, script: str = "", **limits: Any) -> EngineThread:
+        """StartThread an engine thread.
 
         Args:
-            begins: script for the start of the process.
+            script: what the process does at its start.
             limits: new values for constants of the supervisor.
         """
         ...

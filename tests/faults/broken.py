@@ -60,11 +60,11 @@ def no_leaks(talk: Talk) -> Iterator[None]:
     usage.assert_not_grown(talk.pid, before, GROWTH)
 
 
-def assert_heard_last(recording: Recording, whole: Samples) -> float:
+def assert_heard_last(recording: Recording, sentence: Samples) -> float:
     """Assert that the last sentence was heard whole, and return when its sound started."""
     samples = recording.samples
-    start, _ = next(likeliest(samples, [[whole]]), (0, [whole]))
-    (compared,) = assert_heard(samples[start:], [whole])
+    start, _ = next(likeliest(samples, [[sentence]]), (0, [sentence]))
+    (compared,) = assert_heard(samples[start:], [sentence])
     return recording.time_of(start + compared.offset)
 
 

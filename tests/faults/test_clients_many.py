@@ -24,7 +24,7 @@ from tests.support import processes, usage
 from tests.support.connection import Wire
 from tests.support.processes import children
 from tests.support.timing import assert_within, limits
-from tests.tools.witness import Witness
+from tests.tools.goal_monitor import GoalMonitor
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -214,7 +214,7 @@ def test_a_server_with_a_full_backlog_does_not_block_clients(scripted: Talk, com
                     connected = stack.enter_context(socket.socket(socket.AF_UNIX))
                     connected.setblocking(False)
                     connected.connect(scripted.socket)
-            for client in [scripted.start(*words) for words in commands]:
+            for client in [scripted.start(*args) for args in commands]:
                 done = scripted.finish(client, timeout=10)
                 assert (done.code, done.out) == (3, ""), done
                 assert "restart it if it hangs" in done.err
@@ -323,7 +323,7 @@ def test_60_clients_leave_the_engine_enough_of_40_descriptors(home: str) -> None
         wait_for_descriptors(pid, before)
         assert run([*TALK, "say", "--wait", "hello"], env).code == 0
         lines = server.log.splitlines()
-        about = [line for line in lines if "files may be open" in line or "Traceback" in line or "bug" in line]
+        about = [line for line in lines if "open files" in line or "Traceback" in line or "bug" in line]
         assert len(about) <= 2, server.log  # at the start, and once for all refused clients
         assert len(lines) < 12, server.log
 
@@ -373,7 +373,7 @@ def test_the_server_raises_its_descriptor_limit_for_max_clients(home: str) -> No
         with contextlib.ExitStack() as stack:
             for _ in range(400):
                 stack.enter_context(Wire(path))
-        assert "files may be open" not in server.log
+        assert "open files" not in server.log
 
 
 #: Number of unanswered goals, fewer than the queue accepts.
@@ -383,7 +383,7 @@ AHEAD = 50
 @pytest.mark.parametrize("goals", [500, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_a_cancel_racing_with_the_end_gives_exactly_one_end_state(make_talk: MakeTalk, goals: int) -> None:
     talk = make_talk(scripted=True, watched=False)
-    witness = Witness(talk.socket)
+    witness = GoalMonitor(talk.socket)
     over = threading.Event()
 
     def cancel() -> None:

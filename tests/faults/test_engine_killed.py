@@ -201,10 +201,10 @@ def _feeding(talk: Talk, player: int) -> bool:
 
 def _assert_lost(talk: Talk, goal_id: str, number: signal.Signals) -> Message:
     """Assert that a goal was ABORTED because its engine got this signal, and return the goal."""
-    reason, words, _ = SIGNALS[number]
+    reason, error, _ = SIGNALS[number]
     assert await_end(talk, goal_id, HANG) == "ABORTED"
     goal = talk.goal(goal_id)
-    assert_aborted(goal, reason, words)
+    assert_aborted(goal, reason, error)
     return goal
 
 
@@ -241,9 +241,9 @@ if "talkcli.engine.child.main" in "".join(sys.orig_argv):
 
 #: How a goal is ended whose killed player cannot be reaped, and the limit for its end in seconds.
 STUCK: dict[str, tuple[Callable[[Talk], object], float]] = {
-    "its engine killed": (lambda talk: os.kill(engine_process(talk), signal.SIGKILL), KILL_LIMIT_S + SLACK),
-    "stopped": (lambda talk: talk.request("cancel"), CANCEL),
-    "its player killed": (
+    "engine killed": (lambda talk: os.kill(engine_process(talk), signal.SIGKILL), KILL_LIMIT_S + SLACK),
+    "goal stopped": (lambda talk: talk.request("cancel"), CANCEL),
+    "player killed": (
         lambda talk: os.kill(player_process(talk), signal.SIGKILL),
         STALL_LIMIT_S + PLAYER_KILL_LIMIT_S + KILL_LIMIT_S + SLACK,
     ),
@@ -271,7 +271,7 @@ def test_a_synthesis_without_progress_is_aborted(make_talk: MakeTalk, sink: Sink
 
 @pytest.mark.parametrize(
     "cases",
-    [["its engine killed", "stopped"], pytest.param(["its player killed"], marks=pytest.mark.slow)],
+    [["engine killed", "goal stopped"], pytest.param(["player killed"], marks=pytest.mark.slow)],
     ids=" and ".join,
 )
 def test_a_player_that_cannot_be_reaped_does_not_block_the_next_goal(
@@ -299,9 +299,9 @@ def test_a_player_that_cannot_be_reaped_does_not_block_the_next_goal(
             talk, goal, limit = talks[case], goals[case], STUCK[case][1]
             assert await_end(talk, goal, limit + 2) == "ABORTED"
             ended = talk.watcher.arrived(talk.watcher.wait_for(goal, "ABORTED")) - started_at[case]
-            words = "silence was not confirmed" if case == "stopped" else "the player could not be stopped"
-            assert_aborted(talk.goal(goal), "not_silent", words)
-            assert_within(ended, limit, f"the end of a goal that was {case}")
+            error = "silence was not confirmed" if case == "goal stopped" else "the player could not be stopped"
+            assert_aborted(talk.goal(goal), "not_silent", error)
+            assert_within(ended, limit, f"the end of a goal, {case}")
         for case, talk in talks.items():
             player = players[case]
             assert os.path.exists(f"/proc/{player}"), "the player was reaped, so nothing was tested"

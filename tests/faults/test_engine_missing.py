@@ -255,13 +255,13 @@ def test_goals_end_if_a_temporary_failure_follows_a_permanent_one(make_talk: Mak
 
 @pytest.mark.parametrize("option", [("--driver", "parrot"), ("--driver", "nsss"), ("--voice", "parrot")], ids=" ".join)
 def test_an_unknown_driver_or_voice_stops_the_server_at_start(tmp_path: Path, option: tuple[str, str]) -> None:
-    place = str(tmp_path / "s")
-    done = run([*SERVE, "--socket", place, *option], environment(str(tmp_path)))
+    path = str(tmp_path / "s")
+    done = run([*SERVE, "--socket", path, *option], environment(str(tmp_path)))
     assert done.code == 2
     (error,) = done.err.splitlines()
     assert error.startswith("talk: "), error
     assert f'"{option[1]}"' in error or f"'{option[1]}'" in error, error
-    assert not os.path.exists(place)
+    assert not os.path.exists(path)
 
 
 def test_a_server_waiting_for_its_engine_can_be_stopped(make_talk: MakeTalk) -> None:

@@ -7,7 +7,7 @@ import os
 import pytest
 
 from tests.tools.fuzz_lines import fuzz
-from tests.tools.fuzz_texts import today
+from tests.tools.fuzz_texts import daily_seed
 
 SECONDS = float(os.environ.get("TALK_TEST_FUZZ") or (30 if os.environ.get("CI") else 8))
 
@@ -21,4 +21,4 @@ def test_every_mutated_line_gets_one_reply(count: int) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(int(SECONDS) + 300)
 def test_every_line_mutated_with_todays_seed_gets_one_reply() -> None:
-    assert fuzz(today(), seconds=SECONDS).total() > 400 * SECONDS
+    assert fuzz(daily_seed(), seconds=SECONDS).total() > 400 * SECONDS

@@ -189,7 +189,7 @@ def test_speech_works_again_after_the_device_was_unplugged(talk: Talk, server: S
             assert talk.run("say", "--wait", "--", LOW).code == 0
 
 
-@pytest.mark.parametrize("server", [Sink], indirect=True, ids=["PulseAudio"])  # PipeWire suspends nothing that plays
+@pytest.mark.parametrize("server", [Sink], indirect=True, ids=["PulseAudio"])  # PipeWire never suspends a device in use
 def test_a_suspended_device_aborts_the_sentence_in_time(talk: Talk, server: Server, card: Card) -> None:
     with limits():
         goal = start_goal(talk, LONG)

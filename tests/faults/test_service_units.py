@@ -62,9 +62,9 @@ def command_of(unit: str) -> list[str]:
     return [word.replace("%%", "%").replace("$$", "$") for word in shlex.split(line)]
 
 
-def passing_command(passed: socket.socket, *words: str) -> list[str]:
+def passing_command(passed: socket.socket) -> list[str]:
     """Return a command that starts a scripted server with this socket."""
-    return [sys.executable, "-S", "-c", PASS_SOCKET, str(passed.fileno()), *SCRIPTED, *words]
+    return [sys.executable, "-S", "-c", PASS_SOCKET, str(passed.fileno()), *SCRIPTED]
 
 
 def assert_valid_unit(home: str, name: str, **units: str) -> None:
@@ -190,7 +190,7 @@ def test_printing_the_system_unit_warns_if_its_user_cannot_run_talk(home: str) -
     for command in (script, f"{home}/bin/talk"):
         done = run([command, "serve", "--print-unit", "system"], environment(home))
         assert done.code == 0
-        warning = f"the service's user can't enter {private}, but this talk needs {script}; install talk for all users"
+        warning = f"talk needs {script}, but the service's user can't enter {private}; install talk for all users"
         assert warning in done.err
         assert done.out.count("[Service]") == 1  # only the unit is printed
     assert run([script, "serve", "--print-unit", "user"], environment(home)).err == ""
@@ -286,14 +286,14 @@ def test_an_unusable_passed_socket_is_refused_with_a_reason(home: str) -> None:
         os.unlink(f"{home}/s")  # without the file, the supervisor has to restart the socket's unit
         assert "systemctl restart talk.socket" in refused(passed, code=11)
     with listening_at(f"{home}/d", socket.SOCK_DGRAM) as passed:
-        assert "doesn't listen" in refused(passed)
+        assert "is not a listening socket" in refused(passed)
     with socket.socket(socket.AF_INET) as passed:
         passed.bind(("127.0.0.1", 0))
         passed.listen()
         assert "not a Unix socket" in refused(passed)
     near, far = socket.socketpair()
     with near, far:
-        assert "doesn't listen" in refused(near)  # Accept=yes
+        assert "is not a listening socket" in refused(near)  # Accept=yes
     if sys.platform.startswith("linux"):
         with listening_at(f"\0talk-{os.getpid()}") as passed:
             assert "has no path" in refused(passed)

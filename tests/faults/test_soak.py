@@ -15,7 +15,7 @@ SECONDS = float(os.environ.get("TALK_TEST_SOAK") or (60 if os.environ.get("CI") 
 @pytest.mark.slow
 @pytest.mark.timeout(int(SECONDS) + 400)
 def test_random_goals_survive_a_fault_every_few_seconds() -> None:
-    report = soak(SECONDS, seed=random.randrange(1 << 30), every=3, least=int(SECONDS / 12) + 1)
+    report = soak(SECONDS, seed=random.randrange(1 << 30), every=3, min_faults=int(SECONDS / 12) + 1)
     print(report)
     assert report.ends.total() > 5 * SECONDS
     assert report.heard_whole > SECONDS / 30

@@ -258,12 +258,12 @@ def _as_tmp(home: str) -> None:
     os.chmod(home, 0o1777)
 
 
-def place(home: str) -> str:
+def runtime_directory(home: str) -> str:
     return f"{home}/runtime-{os.getuid()}"
 
 
 def dangling_link(home: str) -> None:
-    os.symlink("elsewhere", place(home))
+    os.symlink("elsewhere", runtime_directory(home))
 
 
 def link(home: str) -> None:
@@ -273,20 +273,20 @@ def link(home: str) -> None:
 
 def link_inside(home: str) -> None:
     link(home)
-    os.unlink(place(home))
-    os.mkdir(place(home), 0o700)
-    os.symlink("../elsewhere", f"{place(home)}/talk")
+    os.unlink(runtime_directory(home))
+    os.mkdir(runtime_directory(home), 0o700)
+    os.symlink("../elsewhere", f"{runtime_directory(home)}/talk")
 
 
 def open_inside(home: str) -> None:
-    os.mkdir(place(home), 0o700)
-    os.mkdir(f"{place(home)}/talk")
-    os.chmod(f"{place(home)}/talk", 0o777)
+    os.mkdir(runtime_directory(home), 0o700)
+    os.mkdir(f"{runtime_directory(home)}/talk")
+    os.chmod(f"{runtime_directory(home)}/talk", 0o777)
 
 
 def open_to_all(home: str) -> None:
     open_inside(home)
-    os.chmod(place(home), 0o777)
+    os.chmod(runtime_directory(home), 0o777)
 
 
 @pytest.mark.usefixtures("_as_tmp")
@@ -298,7 +298,7 @@ def test_an_unsafe_runtime_directory_is_refused_with_the_reason(home: str, fault
     before = sorted(Path(home).rglob("*"))
     done = run(SERVE, environment(home))
     assert (done.code, done.out) == (11, ""), done
-    assert place(home) in done.err
+    assert runtime_directory(home) in done.err
     assert "Traceback" not in done.err
     assert sorted(Path(home).rglob("*")) == before, "files were created or removed"
 
@@ -308,18 +308,18 @@ def test_an_unsafe_runtime_directory_is_refused_with_the_reason(home: str, fault
 @pytest.mark.parametrize("names", [["talk"], [""], ["", "talk"]], ids=["inside", "whole", "both"])
 def test_a_runtime_directory_of_another_user_is_refused(home: str, names: list[str]) -> None:
     for name in names:
-        os.makedirs(f"{place(home)}/{name}", 0o700)
-        os.chown(f"{place(home)}/{name}", NOBODY, NOBODY)
+        os.makedirs(f"{runtime_directory(home)}/{name}", 0o700)
+        os.chown(f"{runtime_directory(home)}/{name}", NOBODY, NOBODY)
     done = run(SERVE, environment(home))
     assert (done.code, done.out) == (11, ""), done
-    assert place(home) in done.err
+    assert runtime_directory(home) in done.err
 
 
 @pytest.mark.usefixtures("_as_tmp", "nobody_serves")
 def test_a_new_runtime_directory_is_private_whatever_the_umask(home: str) -> None:
     env = environment(home)
     with serving(env, command=["sh", "-c", 'umask 0; exec "$@"', "sh", *SERVE]):
-        for path in (place(home), f"{place(home)}/talk"):
+        for path in (runtime_directory(home), f"{runtime_directory(home)}/talk"):
             assert stat.S_IMODE(os.lstat(path).st_mode) == 0o700
             assert os.lstat(path).st_uid == os.getuid()
         assert run([*TALK, "status"], env).code == 0

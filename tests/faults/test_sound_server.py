@@ -126,7 +126,7 @@ def test_row_41_goals_are_aborted_until_lost_sound_returns(make_talk: MakeTalk, 
             talk.stop()
             ends, case = FAULTS[name].ends(player), f"{name}, {player}"
             assert_within(lost, ends[0].within, f"the end of a goal, {case}")
-            assert_within(meanwhile, ends[1].within, f"the end of a goal meanwhile, {case}")
+            assert_within(meanwhile, ends[1].within, f"the end of a goal during the fault, {case}")
             assert_within(again, RETURNED, f"the next goal, {case}")
 
 

@@ -206,7 +206,7 @@ def test_terminal_escapes_in_texts_ids_keys_and_names_are_shown_escaped(scripted
     active = start_goal(scripted, f"never-ends {HOSTILE}", number=1, key=HOSTILE)
     send(scripted, f"waits {HOSTILE}")
     commands = (["status"], ["log"], ["status", goal], ["status", active], ["cancel", "\x1b[31m"], ["set"], ["cancel"])
-    shown = [scripted.run(*words) for words in commands]
+    shown = [scripted.run(*args) for args in commands]
     scripted.stop()
     out, err = watch.communicate(timeout=10)
     for text in [out, err, scripted.log, failed.err, own.err, *(command.out + command.err for command in shown)]:

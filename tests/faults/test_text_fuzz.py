@@ -8,7 +8,7 @@ import random
 
 import pytest
 
-from tests.tools.fuzz_texts import Case, cases, crashers, list_voices, speak_all, today
+from tests.tools.fuzz_texts import Case, cases, crashers, daily_seed, list_voices, speak_all
 
 SECONDS = float(os.environ.get("TALK_TEST_FUZZ") or (30 if os.environ.get("CI") else 10))
 #: Number of texts of each kind that crashes libespeak-ng.
@@ -33,7 +33,7 @@ def test_mutated_texts_end_once_and_never_overflow_a_buffer(count: int | None, g
 @pytest.mark.timeout(300)
 def test_crashing_texts_with_todays_seed_are_spoken_with_the_guard() -> None:
     voices = list_voices()
-    source = random.Random(today())
+    source = random.Random(daily_seed())
     texts = [
         Case(source.choice(voices) if voice is None else voice, text)
         for voice, text in itertools.islice(crashers(source), 5 * TEXTS_PER_KIND)

@@ -82,8 +82,8 @@ def as_user(uid: int, *groups: int) -> list[str]:
 
 
 def stranger(path: str, *requests: dict[str, object], groups: Sequence[int] = ()) -> subprocess.CompletedProcess[str]:
-    words = [*as_user(NOBODY, *groups), PYTHON, "-c", STRANGER, path, *map(json.dumps, requests)]
-    return subprocess.run(words, cwd="/", capture_output=True, text=True, timeout=20, check=False)
+    command = [*as_user(NOBODY, *groups), PYTHON, "-c", STRANGER, path, *map(json.dumps, requests)]
+    return subprocess.run(command, cwd="/", capture_output=True, text=True, timeout=20, check=False)
 
 
 @contextlib.contextmanager
@@ -203,4 +203,4 @@ def test_a_users_server_admits_root_and_refuses_other_users(home: str) -> None:
         os.chmod(path, 0o666)
         (reply,) = replies(stranger(path, {"request": "status"}))
         assert reply["error"] == "permission_denied"
-        assert "uid 4141, who can let you in" in reply["message"]
+        assert "uid 4141; ask its owner to run" in reply["message"]

@@ -1,4 +1,4 @@
-"""Fixtures: brokers, bridges, and a robot that has both."""
+"""Fixtures for brokers, bridges, robots and desks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.support.surroundings import needs_packages
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator
 
-    #: Starts a bridge for a test, and returns it, online unless that is False: `make_bridge(talk, broker, "anna")`.
+    #: Starts a bridge, and waits until it is online unless `online=False`: `make_bridge(talk, broker, "anna")`.
     MakeBridge = Callable[..., Bridge]
     MakeRobot = Callable[..., Robot]
 
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
 
 _P = ParamSpec("_P")
 
-#: Logins at a secure broker, each with a password of its own: robots, an operator, and one without rights.
+#: Users of a secure broker, each with its own password: robots, an operator, and a user without rights.
 ROBOTS, OPERATORS, OTHERS = ("anna", "bert"), ("olga",), ("otto",)
 
 
 def in_loop(test: Callable[_P, Coroutine[Any, Any, None]]) -> Callable[_P, None]:
-    """Run a test that is a coroutine."""
+    """Run a coroutine as a test."""
 
     @functools.wraps(test)
     def run(*args: _P.args, **named: _P.kwargs) -> None:
@@ -54,7 +54,7 @@ def broker() -> Iterator[Broker]:
 
 @pytest.fixture
 def secure_broker() -> Iterator[Broker]:
-    """A broker with TLS, passwords, and the rules that talk prints for its robots and the operator."""
+    """A broker with TLS, passwords, and the access rules that `talk bridge` prints."""
     users = {name: f"password of {name}" for name in (*ROBOTS, *OPERATORS, *OTHERS)}
     with Broker(secure=True, users=users, acl=topics.access_rules(OPERATORS) + "\n") as result:
         yield result
@@ -62,12 +62,15 @@ def secure_broker() -> Iterator[Broker]:
 
 @pytest.fixture
 def make_bridge() -> Iterator[MakeBridge]:
-    """Starts bridges; those that still run at the end must end well by SIGTERM. A test asks for its broker before."""
+    """A function that starts bridges. Bridges that still run at the end must exit with 0 after SIGTERM.
+
+    A test must request its broker fixture before this one.
+    """
     bridges: list[Bridge] = []
     with contextlib.ExitStack() as stack:
 
-        def make(*words: Any, online: bool = True, **named: Any) -> Bridge:
-            bridges.append(bridge := stack.enter_context(Bridge(*words, **named)))
+        def make(*arguments: Any, online: bool = True, **named: Any) -> Bridge:
+            bridges.append(bridge := stack.enter_context(Bridge(*arguments, **named)))
             if online:
                 bridge.await_online()
             return bridge
@@ -76,12 +79,12 @@ def make_bridge() -> Iterator[MakeBridge]:
         for bridge in bridges:
             if bridge.running:
                 code = bridge.terminate()
-                assert code == 0, f"the bridge {bridge.name} ended with {code}: {bridge.log}"
+                assert code == 0, f"the bridge {bridge.name} exited with {code}: {bridge.log}"
 
 
 @pytest.fixture
 def make_robot(make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge) -> MakeRobot:
-    """Starts robots that speak by a script: `make_robot("anna", "--allow", "say", groups=["warehouse"])`."""
+    """A function that starts robots with the scripted engine: `make_robot("anna", "--allow", "say", groups=[])`."""
 
     def make(name: str, *options: str, **named: Any) -> Robot:
         talk = make_talk(scripted=True)
@@ -92,13 +95,13 @@ def make_robot(make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge) -> 
 
 @pytest.fixture
 def robot(scripted: Talk, broker: Broker, make_bridge: MakeBridge) -> Robot:
-    """A robot, anna, online, that speaks by a script: for a tenth of a second, or as its texts say."""
+    """The robot anna, online, with the scripted engine."""
     return Robot(scripted, broker, make_bridge(scripted, broker, "anna"))
 
 
 @pytest.fixture(scope="module")
-def lasting_robot() -> Iterator[Robot]:
-    """A robot as `robot` is one, for all tests of a module that leave it as it is."""
+def shared_robot() -> Iterator[Robot]:
+    """A robot like `robot`, for all tests of a module that don't change it."""
     with Broker() as broker, contextlib.closing(Talk(scripted=True)) as talk:
         with Bridge(talk, broker, "anna") as bridge:
             bridge.await_online()
@@ -109,9 +112,9 @@ def lasting_robot() -> Iterator[Robot]:
 
 @pytest.fixture(scope="module")
 def pair() -> Iterator[RealRobots]:
-    """Two robots of the group warehouse, wh-1 and wh-2, that allow all requests, with a broker of their own.
+    """The robots wh-1 and wh-2 of the group warehouse, which allow all requests, and their broker.
 
-    All tests of a module share them: each leaves them silent, and with nothing to say.
+    All tests of a module share them. Each test must leave them without goals.
     """
     allowed = ("--allow", ",".join(sorted(ALLOWABLE_REQUESTS)))
     with Broker() as broker, RealRobots(broker, ["wh-1", "wh-2"], ["warehouse"], allowed) as result:
@@ -120,7 +123,7 @@ def pair() -> Iterator[RealRobots]:
 
 @pytest.fixture
 def desk(pair: RealRobots) -> Iterator[Desk]:
-    """A desk that asks both robots of the pair; all their goals are cancelled in the end."""
+    """A desk that selects both robots of the pair. All their goals are cancelled afterwards."""
     with Desk(pair.broker, env={"TALK_ROBOT": "wh-*"}) as result:
         yield result
     request(pair, "resume")
@@ -129,20 +132,20 @@ def desk(pair: RealRobots) -> Iterator[Desk]:
 
 @pytest.fixture
 def fleet(pair: RealRobots, monkeypatch: pytest.MonkeyPatch) -> Iterator[Fleet]:
-    """The library for the pair; all their goals are cancelled in the end."""
+    """The library for the pair. All their goals are cancelled afterwards."""
     yield fleet_of(pair.broker, monkeypatch)
     request(pair, "resume")
     request(pair, "cancel")
 
 
 def fleet_of(broker: Broker, monkeypatch: pytest.MonkeyPatch, *, grace: float = 0.05, user: str | None = None) -> Fleet:
-    """Return the library for a broker; `grace`: seconds in which the broker may still tell what it keeps."""
+    """Return the library for a broker. `grace` is the time to wait for retained messages, in seconds."""
     needs_packages("paho")
     from talkcli.fleet.desk import link
 
-    monkeypatch.setattr(link, "RETAINED_GRACE_S", grace)  # mosquitto tells at once all that it keeps
-    for each in [name for name in os.environ if name.startswith("TALK_") and not name.startswith("TALK_TEST_")]:
-        monkeypatch.delenv(each)
+    monkeypatch.setattr(link, "RETAINED_GRACE_S", grace)  # mosquitto sends all retained messages at once
+    for name in [name for name in os.environ if name.startswith("TALK_") and not name.startswith("TALK_TEST_")]:
+        monkeypatch.delenv(name)
     if user:
         monkeypatch.setenv("TALK_MQTT_USER", user)
     return Fleet(broker.url)

@@ -1,4 +1,4 @@
-"""Home Assistant's rules for a device that is announced by MQTT discovery, and a client that goes by them.
+"""Home Assistant's rules for MQTT device discovery, and a client that follows them.
 
 The rules are those of www.home-assistant.io/integrations/mqtt: device discovery payload, notify, button, sensor, binary
 sensor. Home Assistant itself is not installed here.
@@ -16,14 +16,14 @@ from tests.support.mqtt import Listener
 if TYPE_CHECKING:
     from tests.support.broker import Broker
 
-#: A topic on which Home Assistant hears of a device.
+#: A topic on which a device is announced to Home Assistant.
 TOPIC = re.compile(r"homeassistant/device/(?:[a-zA-Z0-9_-]+/)?[a-zA-Z0-9_-]+/config")
-#: What Home Assistant says once it has started.
+#: The topic and the message that Home Assistant publishes when it has started.
 BIRTH = ("homeassistant/status", "online")
 _ANY = {"platform", "unique_id", "name", "qos", "icon", "json_attributes_topic", "json_attributes_template"}
 _COMMAND = {*_ANY, "command_topic", "retain"}
 _STATE = {*_ANY, "state_topic", "value_template", "device_class"}
-#: The keys that a part of the payload must have, and all keys that it may have.
+#: The required and the allowed keys of each part of the payload.
 KEYS = {
     "payload": ({"device", "origin", "components"}, {"device", "origin", "components", "availability", "qos"}),
     "device": ({"identifiers", "name"}, {"identifiers", "name", "manufacturer", "model", "sw_version"}),
@@ -34,13 +34,13 @@ KEYS = {
     "sensor": ({"unique_id", "state_topic"}, {*_STATE, "options", "state_class"}),
     "binary_sensor": ({"unique_id", "state_topic"}, {*_STATE, "payload_on", "payload_off"}),
 }
-#: A template in words that Jinja and Python read alike; Jinja takes `items` and the like for methods.
+#: A template that means the same in Jinja and Python. In Jinja, names such as `items` are methods.
 _WORD = (
     r"value_json(?:\.(?!items\b|keys\b|values\b|get\b|pop\b|copy\b)\w+)*|'\w+'|if|else|and|or|not|None|\{\}|\| tojson"
 )
 _TEMPLATE = rf'"\{{\{{ (?:\(?(?:{_WORD})\)? )+\}}\}}"'
 _TEXT, _TEXTS = '".+"', r'\[".+"\]'
-#: How a value looks in JSON; others are texts.
+#: The JSON form of a value. Values that are not listed are texts.
 VALUES = {
     "qos": "[012]", "retain": "true|false", "name": f"{_TEXT}|null", "identifiers": _TEXTS, "options": _TEXTS,
     "device_class": '"(enum|running|sound)"', "state_class": '"measurement"', "command_topic": '"[^+#]+"',
@@ -50,36 +50,36 @@ VALUES = {
 
 
 def faults(topic: str, payload: bytes) -> list[str]:
-    """Return what Home Assistant would not accept of a device."""
+    """Return the errors that Home Assistant would find in the announcement of a device."""
     device = json.loads(payload)
-    entities = [each for each in device["components"].values() if len(each) > 1]
-    parts = [("payload", device), *((each, device[each]) for each in ("device", "origin"))]
-    parts += [("availability", each) for each in device["availability"]]
-    parts += [(each["platform"], each) for each in entities]
-    found = [] if TOPIC.fullmatch(topic) else [topic]
+    entities = [component for component in device["components"].values() if len(component) > 1]
+    parts = [("payload", device), *((key, device[key]) for key in ("device", "origin"))]
+    parts += [("availability", availability) for availability in device["availability"]]
+    parts += [(entity["platform"], entity) for entity in entities]
+    errors = [] if TOPIC.fullmatch(topic) else [topic]
     for kind, part in parts:
         required, allowed = KEYS[kind]
-        found += [f"{kind}: {each}" for each in (required - part.keys()) | (part.keys() - allowed)]
+        errors += [f"{kind}: {key}" for key in (required - part.keys()) | (part.keys() - allowed)]
         texts = {key: json.dumps(value) for key, value in part.items()}
-        found += [
+        errors += [
             f"{kind}: {key}: {text}" for key, text in texts.items() if not re.fullmatch(VALUES.get(key, _TEXT), text)
         ]
-    if len({each["unique_id"] for each in entities}) < len(entities):
-        found.append("two entities have the same unique_id")
-    found += [each["name"] for each in entities if ("options" in each) != (each.get("device_class") == "enum")]
-    return found
+    if len({entity["unique_id"] for entity in entities}) < len(entities):
+        errors.append("two entities have the same unique_id")
+    errors += [entity["name"] for entity in entities if ("options" in entity) != (entity.get("device_class") == "enum")]
+    return errors
 
 
 def rendered(template: str, payload: bytes) -> str:
-    """Return the text that a template makes of a message."""
-    words, filtered, _ = template.removeprefix("{{ ").removesuffix(" }}").partition(" | tojson")
-    said = json.loads(payload, object_hook=lambda each: SimpleNamespace(**each))
-    value = eval(words, {"value_json": said})
+    """Return the result of a template for a message."""
+    expression, filtered, _ = template.removeprefix("{{ ").removesuffix(" }}").partition(" | tojson")
+    message = json.loads(payload, object_hook=lambda fields: SimpleNamespace(**fields))
+    value = eval(expression, {"value_json": message})
     return json.dumps(value, default=vars) if filtered else str(value)
 
 
 class HomeAssistant(Listener):
-    """A Home Assistant that has started, and hears of devices."""
+    """A Home Assistant that has started, and listens for devices."""
 
     def __init__(self, broker: Broker, **more: Any) -> None:
         super().__init__(broker, "homeassistant/device/#", **more)
@@ -88,28 +88,28 @@ class HomeAssistant(Listener):
         return self
 
     def device(self) -> dict[str, Any]:
-        """Wait for a device, and return its payload; from now on its entities have states."""
-        message = self.await_message(lambda each: bool(TOPIC.fullmatch(each.topic) and each.payload))
+        """Wait for a device, subscribe to its states, and return its announcement."""
+        message = self.await_message(lambda message: bool(TOPIC.fullmatch(message.topic) and message.payload))
         assert faults(message.topic, message.payload) == []
-        topics = {each["topic"] for each in message.json["availability"]}
-        for each in topics | {message.json["components"]["state"]["state_topic"]}:
-            assert self.subscribe(each) <= 1
+        topics = {availability["topic"] for availability in message.json["availability"]}
+        for topic in topics | {message.json["components"]["state"]["state_topic"]}:
+            assert self.subscribe(topic) <= 1
         return message.json
 
-    def await_states(self, device: dict[str, Any], **wanted: str) -> None:
+    def await_states(self, device: dict[str, Any], **expected: str) -> None:
         """Wait until the entities are in these states."""
-        self.await_message(lambda _: all(self._state(device, key) == state for key, state in wanted.items()))
+        self.await_message(lambda _: all(self._state(device, key) == state for key, state in expected.items()))
 
     def command(self, device: dict[str, Any], key: str, text: str = "PRESS") -> int:
-        """Press a button, or send a message by the notifier; return the broker's reason code."""
+        """Press a button or send a message to the notifier, and return the broker's reason code."""
         entity = device["components"][key]
         return self.publish(entity["command_topic"], text, entity["qos"], entity.get("retain", False))
 
     def _state(self, device: dict[str, Any], key: str) -> str | None:
-        told = {each.topic: each.payload for each in self.messages}
+        payloads = {message.topic: message.payload for message in self.messages}
         (presence,) = device["availability"]
-        if rendered(presence["value_template"], told.get(presence["topic"]) or b'{"online": false}') != "online":
+        if rendered(presence["value_template"], payloads.get(presence["topic"]) or b'{"online": false}') != "online":
             return "unavailable"
         entity = device["components"][key]
-        payload = told.get(entity["state_topic"])
+        payload = payloads.get(entity["state_topic"])
         return rendered(entity["value_template"], payload) if payload else None

@@ -1,4 +1,4 @@
-"""Many robots at one broker: real ones, and hundreds of simulated ones."""
+"""Many robots at one broker, real and simulated."""
 
 from __future__ import annotations
 
@@ -27,68 +27,71 @@ if TYPE_CHECKING:
     from tests.support.mqtt import Message
     from tests.support.processes import Clients, Finished
 
-#: Seconds in which started robots are online, even if they share two processors.
-THERE_LIMIT = 30.0
-#: Robots that start or end at the same time.
+#: Time for started robots to come online, even on two processors.
+ONLINE_LIMIT_S = 30.0
+#: Number of robots that are started or stopped at the same time.
 _AT_ONCE = 8
 _ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 
 
-class Roll(Listener):
-    """A listener to the presences of all robots."""
+class PresenceListener(Listener):
+    """A listener for the presence of all robots."""
 
     def __init__(self, broker: Broker) -> None:
         super().__init__(broker, "talk/robot/+/presence")
 
-    def __enter__(self) -> Roll:
+    def __enter__(self) -> PresenceListener:
         return self
 
-    def await_there(self, names: Iterable[str], within: float = THERE_LIMIT) -> float:
+    def await_online(self, names: Iterable[str], within: float = ONLINE_LIMIT_S) -> float:
         """Wait until these robots are online with a server, and return the monotonic time of the last one."""
-        missing = wanted = set(names)
+        missing = expected = set(names)
 
         def complete(message: Message) -> bool:
             nonlocal missing
             name = {message.topic.split("/")[2]}
-            told = message.json if message.payload else {}
-            missing = missing - name if told.get("online") and told.get("server") else missing | (name & wanted)
+            presence = message.json if message.payload else {}
+            online = presence.get("online") and presence.get("server")
+            missing = missing - name if online else missing | (name & expected)
             return not missing
 
-        found = self.find(complete, within)
-        assert found, f"{len(missing)} are not online within {within} s: {sorted(missing)[:10]}"
-        return found.arrived
+        last = self.find(complete, within)
+        assert last, f"{len(missing)} are not online within {within} s: {sorted(missing)[:10]}"
+        return last.arrived
 
-    def await_gone(self, name: str, within: float = THERE_LIMIT) -> None:
+    def await_offline(self, name: str, within: float = ONLINE_LIMIT_S) -> None:
         self.await_message(
-            lambda each: each.topic.split("/")[2] == name and bool(each.payload) and each.json.get("online") is False,
+            lambda message: (
+                message.topic.split("/")[2] == name and bool(message.payload) and message.json.get("online") is False
+            ),
             within,
         )
 
 
 class RealRobots(contextlib.AbstractContextManager["RealRobots"]):
-    """Robots with a scripted engine, each with a server and a bridge of its own, all online.
+    """Online robots with the scripted engine. Each has its own server and bridge.
 
-    After a block without an exception, all robots are ended by SIGTERM and checked.
+    After a block without an exception, all robots are stopped with SIGTERM and checked.
     """
 
     def __init__(
         self, broker: Broker, names: Sequence[str], groups: Sequence[str] = (), options: Sequence[str] = ()
     ) -> None:
-        """Start the robots. `groups` and `options` are for each bridge."""
+        """Start the robots. Each bridge gets the `groups` and `options`."""
         self.broker = broker
         self._groups, self._options = groups, options
         self._by_name: dict[str, Robot] = {}
         with contextlib.ExitStack() as stack:
             self._stack = stack.enter_context(contextlib.ExitStack())
-            _together(self.add, names)
-            with Roll(broker) as roll:
-                roll.await_there(names)
+            _in_parallel(self.add, names)
+            with PresenceListener(broker) as presences:
+                presences.await_online(names)
             stack.pop_all()
 
     def __exit__(self, kind: object, *_error: object) -> None:
         with self._stack:
             if kind is None:
-                _together(_end, self._by_name.values())
+                _in_parallel(_end, self._by_name.values())
 
     def __getitem__(self, name: str) -> Robot:
         return self._by_name[name]
@@ -98,19 +101,19 @@ class RealRobots(contextlib.AbstractContextManager["RealRobots"]):
         return sorted(self._by_name)
 
     def add(self, name: str) -> Robot:
-        # Both are forks of a process that outlives this thread. A process that dies with its parent would end with it.
+        # Both processes are forked from a process that outlives this thread, so they don't die with the thread.
         talk = self._stack.enter_context(contextlib.closing(Talk(scripted=True)))
         bridge = self._stack.enter_context(Bridge(talk, self.broker, name, *self._options, groups=self._groups))
         self._by_name[name] = robot = Robot(talk, self.broker, bridge)
         return robot
 
     def each(self, action: Callable[[Robot], Any]) -> list[Any]:
-        """Return the results of an action for each robot, sorted by their names."""
-        return _together(action, [self._by_name[each] for each in self.names])
+        """Run an action for all robots, and return the results in the order of the robots' names."""
+        return _in_parallel(action, [self._by_name[name] for name in self.names])
 
     def spoken(self) -> dict[str, list[str]]:
-        """Return the texts that each robot has begun to speak."""
-        return dict(zip(self.names, self.each(lambda each: each.spoken), strict=True))
+        """Return the texts that each robot has started to speak."""
+        return dict(zip(self.names, self.each(lambda robot: robot.spoken), strict=True))
 
 
 def _end(robot: Robot) -> None:
@@ -122,16 +125,16 @@ def _end(robot: Robot) -> None:
         robot.talk.check()
 
 
-def _together(action: Callable[[Any], Any], those: Collection[Any]) -> list[Any]:
-    """Return the results of an action that is done for several at once; raise the first error when all are done."""
+def _in_parallel(action: Callable[[Any], Any], items: Collection[Any]) -> list[Any]:
+    """Run an action for several items in parallel, and return the results or raise the first error at the end."""
     with ThreadPoolExecutor(_AT_ONCE) as pool:
-        done = [pool.submit(action, each) for each in those]
+        done = [pool.submit(action, item) for item in items]
         wait(done)
-    return [each.result() for each in done]
+    return [future.result() for future in done]
 
 
 class SimulatedRobots(contextlib.AbstractContextManager["SimulatedRobots"]):
-    """Simulated robots in processes of their own, started; see `tests.tools.simulated`."""
+    """Simulated robots in separate processes (see `tests.tools.simulated`)."""
 
     def __init__(self, broker: Broker, count: int, *, processes: int = 1) -> None:
         self.names = [f"sim-{number + 1:04d}" for number in range(count)]
@@ -139,7 +142,7 @@ class SimulatedRobots(contextlib.AbstractContextManager["SimulatedRobots"]):
         with contextlib.ExitStack() as stack:
             self._directory = stack.enter_context(short_directory("sim-"))
             stack.callback(self._kill)
-            for first, end in pairwise(count * each // processes for each in range(processes + 1)):
+            for first, end in pairwise(count * part // processes for part in range(processes + 1)):
                 self._start(["--robots", str(end - first), "--first", str(first + 1), "--broker", broker.url])
             self._stack = stack.pop_all()
 
@@ -152,50 +155,50 @@ class SimulatedRobots(contextlib.AbstractContextManager["SimulatedRobots"]):
             return file.read()
 
     def spoken(self, goal_id: str) -> dict[str, float]:
-        """Return when each robot began to speak a goal (monotonic time). No robot may have begun it twice."""
+        """Return the monotonic time at which each robot started a goal. No robot may have started it twice."""
         with open(f"{self._directory}/spoken", encoding="utf-8") as file:
             *lines, _unfinished = file.read().split("\n")
-        found = [each for each in map(json.loads, lines) if each["id"] == goal_id]
-        result = {each["robot"]: each["at"] for each in found}
-        assert len(result) == len(found), (
-            f"{goal_id} was spoken more than once: {Counter(each['robot'] for each in found)}"
+        entries = [entry for entry in map(json.loads, lines) if entry["id"] == goal_id]
+        result = {entry["robot"]: entry["at"] for entry in entries}
+        assert len(result) == len(entries), (
+            f"{goal_id} was spoken more than once: {Counter(entry['robot'] for entry in entries)}"
         )
         return result
 
-    def await_there(self, within: float = THERE_LIMIT) -> None:
+    def await_online(self, within: float = ONLINE_LIMIT_S) -> None:
         """Wait until all robots are online for the first time."""
         end = time.monotonic() + within
-        for each in self._processes:
-            assert each.stdout
-            found, _, _ = select.select([each.stdout], [], [], max(0.0, end - time.monotonic()))
-            assert found, f"simulated robots are not online within {within} s: {self.log[-2000:]}"
-            assert "online" in each.stdout.readline(), self.log[-2000:]
+        for process in self._processes:
+            assert process.stdout
+            ready, _, _ = select.select([process.stdout], [], [], max(0.0, end - time.monotonic()))
+            assert ready, f"simulated robots are not online within {within} s: {self.log[-2000:]}"
+            assert "online" in process.stdout.readline(), self.log[-2000:]
 
-    def await_spoken(self, goal_id: str, within: float = THERE_LIMIT) -> None:
-        """Wait until all robots have begun to speak a goal."""
+    def await_spoken(self, goal_id: str, within: float = ONLINE_LIMIT_S) -> None:
+        """Wait until all robots have started to speak a goal."""
         end = time.monotonic() + within
-        while (begun := len(self.spoken(goal_id))) < len(self.names):
-            assert time.monotonic() < end, f"{begun} of {len(self.names)} speak {goal_id} within {within} s"
-            time.sleep(0.05)  # nothing tells when a file grows
+        while (started := len(self.spoken(goal_id))) < len(self.names):
+            assert time.monotonic() < end, f"{started} of {len(self.names)} speak {goal_id} within {within} s"
+            time.sleep(0.05)  # a growing file sends no event
 
     def assert_spoken_once(self, goal_id: str) -> float:
-        """Assert that every robot has begun a goal once, and return the monotonic time of the last one."""
+        """Assert that each robot has started a goal once, and return the monotonic time of the last start."""
         spoken = self.spoken(goal_id)
         assert spoken.keys() == set(self.names), f"not spoken by {set(self.names) - spoken.keys()}"
         return max(spoken.values())
 
     def stop(self) -> None:
-        """End the processes by SIGTERM, and check them."""
-        for each in self._processes:
-            each.terminate()
-        for each in self._processes:
-            code = each.wait(STOP_LIMIT + len(self.names) / 100)
-            assert code == 0, f"simulated robots ended with {code}: {self.log[-2000:]}"
-        for words in ("Traceback", "a bug"):
-            assert words not in self.log, self.log[-2000:]
+        """Stop the processes with SIGTERM, and check them."""
+        for process in self._processes:
+            process.terminate()
+        for process in self._processes:
+            code = process.wait(STOP_LIMIT + len(self.names) / 100)
+            assert code == 0, f"simulated robots exited with {code}: {self.log[-2000:]}"
+        for text in ("Traceback", "a bug"):
+            assert text not in self.log, self.log[-2000:]
 
-    def _start(self, words: Sequence[str]) -> None:
-        command = [sys.executable, "-m", "tests.tools.simulated", *words, "--spoken", f"{self._directory}/spoken"]
+    def _start(self, arguments: Sequence[str]) -> None:
+        command = [sys.executable, "-m", "tests.tools.simulated", *arguments, "--spoken", f"{self._directory}/spoken"]
         with open(f"{self._directory}/log", "ab") as log:
             process = subprocess.Popen(
                 dying_with_parent(command),
@@ -209,42 +212,42 @@ class SimulatedRobots(contextlib.AbstractContextManager["SimulatedRobots"]):
         self._processes.append(process)
 
     def _kill(self) -> None:
-        for each in self._processes:
-            each.kill()
-            each.wait()
-            assert each.stdout
-            each.stdout.close()
+        for process in self._processes:
+            process.kill()
+            process.wait()
+            assert process.stdout
+            process.stdout.close()
 
 
 def request(robots: RealRobots, name: str, **fields: Any) -> None:
-    for reply in robots.each(lambda each: each.talk.request(name, **fields)):
+    for reply in robots.each(lambda robot: robot.talk.request(name, **fields)):
         assert reply["ok"], reply
 
 
 def at_once(clients: Clients, *lines: Sequence[str]) -> list[Finished]:
     """Run several commands at the same time."""
-    return [clients.finish(each) for each in [clients.start(*line) for line in lines]]
+    return [clients.finish(client) for client in [clients.start(*line) for line in lines]]
 
 
-def told(done: Finished) -> dict[str, tuple[str, str, int]]:
-    """Return the id, the state and the code that a desk printed for each robot."""
+def printed_outcomes(done: Finished) -> dict[str, tuple[str, str, int]]:
+    """Return the goal's id, the state and the exit code that a desk printed for each robot."""
     lines = [line.split() for line in done.out.splitlines()]
-    found = {robot: (goal_id, state, int(code)) for robot, goal_id, state, code in lines}
-    assert len(found) == len(lines), f"a robot twice: {done.out}"
-    return found
+    outcomes = {robot: (goal_id, state, int(code)) for robot, goal_id, state, code in lines}
+    assert len(outcomes) == len(lines), f"a robot was printed twice: {done.out}"
+    return outcomes
 
 
 def objects(done: Finished) -> dict[str, dict[str, Any]]:
-    """Return the object that a desk printed for each robot."""
-    return {each["robot"]: each for each in map(json.loads, done.out.splitlines())}
+    """Return the JSON object that a desk printed for each robot."""
+    return {outcome["robot"]: outcome for outcome in map(json.loads, done.out.splitlines())}
 
 
 def alike(names: Sequence[str], goal_id: str, state: str, code: int) -> dict[str, tuple[str, str, int]]:
-    """Return what a desk prints if all robots end alike."""
+    """Return the outcomes that a desk prints if all robots have the same one."""
     return dict.fromkeys(names, (goal_id, state, code))
 
 
-def assert_told(done: Finished, code: int, wanted: Mapping[str, tuple[str, str, int]], summary: str) -> None:
-    """Assert what a desk printed for each robot, its exit code, and its summary."""
-    assert told(done) == wanted, done
+def assert_outcomes(done: Finished, code: int, expected: Mapping[str, tuple[str, str, int]], summary: str) -> None:
+    """Assert the outcomes, the exit code and the summary of a command."""
+    assert printed_outcomes(done) == expected, done
     assert (done.code, done.err.splitlines()[-1:]) == (code, [f"talk: {summary}"]), done

@@ -1,4 +1,4 @@
-"""A robot of a fleet: its server, its bridge, and their broker."""
+"""A robot of a fleet, with its server, bridge and broker."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ class Robot:
 
     @property
     def spoken(self) -> list[str]:
-        """The texts that it has begun to speak since the start of its server."""
+        """The texts that the robot has started to speak since its server started."""
         return self.talk.watcher.texts("ACTIVE")
 
-    def desk(self, *words: str, timeout: float = 20) -> Finished:
-        """Run one command at a desk: `robot.desk("say", "--wait", "--", "battery low")`."""
-        return desk(self.broker, self.name, *words, timeout=timeout)
+    def desk(self, *arguments: str, timeout: float = 20) -> Finished:
+        """Run a command at a desk: `robot.desk("say", "--wait", "--", "battery low")`."""
+        return desk(self.broker, self.name, *arguments, timeout=timeout)
 
     def listen(self, *topics: str) -> Listener:
-        """Return a listener to its presence, which has come already, and to other topics under its name."""
-        listener = Listener(self.broker, self.presence, *(f"talk/robot/{self.name}/{each}" for each in topics))
+        """Return a listener that has received the presence, and that also listens on `topics` of this robot."""
+        listener = Listener(self.broker, self.presence, *(f"talk/robot/{self.name}/{topic}" for topic in topics))
         try:
             listener.await_message(self.is_online)
         except BaseException:
@@ -54,15 +54,19 @@ class Robot:
         return listener
 
     def is_online(self, message: Message) -> bool:
-        told = self._told(message)
-        return bool(told.get("online") and told["server"])
+        presence = self._presence_in(message)
+        return bool(presence.get("online") and presence["server"])
+
+    def has_current_server(self, message: Message) -> bool:
+        """Return whether the robot is online with its current server process."""
+        return self.is_online(message) and message.json["server"]["pid"] == self.talk.pid
 
     def is_offline(self, message: Message) -> bool:
-        return self._told(message).get("online") is False
+        return self._presence_in(message).get("online") is False
 
     def is_without_server(self, message: Message) -> bool:
-        told = self._told(message)
-        return bool(told.get("online") and told["server"] is None)
+        presence = self._presence_in(message)
+        return bool(presence.get("online") and presence["server"] is None)
 
-    def _told(self, message: Message) -> dict[str, object]:
+    def _presence_in(self, message: Message) -> dict[str, object]:
         return message.json if message.topic == self.presence and message.payload else {}

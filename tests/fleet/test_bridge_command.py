@@ -1,4 +1,4 @@
-"""`talk bridge` as a command: refused options, printed units and rules, and words for a supervisor."""
+"""The command `talk bridge`: usage errors, printed units and access rules, and systemd notifications."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     from tests.support.processes import Talk
 
 
-def bridge(home: str, *words: str, **extra: str) -> tuple[int, str, str]:
-    return run_talk(["bridge", *words], environment(home, **extra), 20)
+def run_bridge(home: str, *arguments: str, **extra: str) -> tuple[int, str, str]:
+    return run_talk(["bridge", *arguments], environment(home, **extra), 20)
 
 
 @pytest.mark.parametrize(
-    ("words", "env", "said"),
+    ("arguments", "env", "error"),
     [
         ("", {}, "--name is missing"),
         ("--name a/b", {}, "--name: 'a/b' is not a valid name; it must have 1 to 59 characters"),
@@ -49,12 +49,12 @@ def bridge(home: str, *words: str, **extra: str) -> tuple[int, str, str]:
         ("--name anna", {"TALK_BROKER": "mqtts://b", "TALK_MQTT_CA": "/no"}, "TALK_MQTT_CA: /no: No such file"),
     ],
 )
-def test_a_mistake_is_named_with_the_next_step(home: str, words: str, env: dict[str, str], said: str) -> None:
-    code, out, err = bridge(home, *words.split(), **env)
-    assert (code, out, said in err, "Traceback" in err, "hunter2" in err) == (2, "", True, False, False), err
+def test_usage_errors_name_the_next_step(home: str, arguments: str, env: dict[str, str], error: str) -> None:
+    code, out, err = run_bridge(home, *arguments.split(), **env)
+    assert (code, out, error in err, "Traceback" in err, "hunter2" in err) == (2, "", True, False, False), err
 
 
-def test_without_paho_it_says_what_to_install_but_prints_all_the_same(home: str, tmp_path: Path) -> None:
+def test_only_printing_works_without_paho(home: str, tmp_path: Path) -> None:
     env = record_imports(tmp_path, environment(home, TALK_BROKER="mqtt://127.0.0.1:1"), ["paho"])
     done = run([*TALK, "bridge", "--name", "anna"], env)
     assert (done.code, done.out) == (2, "")
@@ -63,14 +63,14 @@ def test_without_paho_it_says_what_to_install_but_prints_all_the_same(home: str,
     assert (done.code, done.err, "[Unit]" in done.out) == (0, "", True), done
 
 
-def test_the_acl_is_printed(home: str) -> None:
-    assert bridge(home, "--print-acl") == (0, topics.access_rules() + "\n", "")
+def test_the_access_rules_are_printed(home: str) -> None:
+    assert run_bridge(home, "--print-acl") == (0, topics.access_rules() + "\n", "")
     rules = topics.access_rules(homeassistant=True, name="r2.d2") + "\n"
-    assert bridge(home, "--name", "r2.d2", "--homeassistant", "--print-acl") == (0, rules, "")
+    assert run_bridge(home, "--name", "r2.d2", "--homeassistant", "--print-acl") == (0, rules, "")
 
 
-def printed(home: str, name: str, *options: str) -> str:
-    code, out, _ = bridge(home, "--name", "anna", *options, "--print-unit", name)
+def printed_unit(home: str, name: str, *options: str) -> str:
+    code, out, _ = run_bridge(home, "--name", "anna", *options, "--print-unit", name)
     assert code == 0
     return out
 
@@ -81,7 +81,7 @@ def values(unit: str, name: str) -> list[str]:
 
 def command_of(unit: str) -> list[str]:
     (line,) = values(unit, "ExecStart")
-    return [each.replace("%%", "%").replace("$$", "$") for each in shlex.split(line)]
+    return [part.replace("%%", "%").replace("$$", "$") for part in shlex.split(line)]
 
 
 @pytest.mark.parametrize(
@@ -91,39 +91,37 @@ def command_of(unit: str) -> list[str]:
         ("system", "/etc/systemd/system", "/etc/talk/bridge.env"),
     ],
 )
-def test_a_unit_has_its_place_its_environment_and_its_rights(
-    home: str, name: str, folder: str, environment_file: str
-) -> None:
-    unit = printed(home, name)
+def test_a_unit_names_its_path_and_options(home: str, name: str, folder: str, environment_file: str) -> None:
+    unit = printed_unit(home, name)
     head = unit.partition("\n[Unit]\n")[0].splitlines()
     assert head[0].startswith(f"# {folder}/talk-bridge.service: ")
-    assert any(f"talk bridge --name NAME --print-unit {name} " in each for each in head)
-    assert any(environment_file.replace("%h", "~") in each for each in head)
-    assert any("daemon-reload" in each and "enable --now talk-bridge" in each for each in head)
-    assert all(each.startswith("#") and len(each) <= 120 for each in head)
+    assert any(f"talk bridge --name NAME --print-unit {name} " in line for line in head)
+    assert any(environment_file.replace("%h", "~") in line for line in head)
+    assert any("daemon-reload" in line and "enable --now talk-bridge" in line for line in head)
+    assert all(line.startswith("#") and len(line) <= 120 for line in head)
     settings = {
         "EnvironmentFile": environment_file, "Type": "notify", "WatchdogSec": "30", "Restart": "on-failure",
-        "RestartPreventExitStatus": "2",  # not 11: the other bridge of its name may go
+        "RestartPreventExitStatus": "2",  # not 11: the other bridge with this name may end
         "RestartSec": "10", "StartLimitIntervalSec": "0", "RestrictAddressFamilies": "AF_UNIX AF_INET AF_INET6",
     }  # fmt: skip
     if name == "system":
         settings |= {"User": "talk-bridge", "Group": "audio", "PrivateDevices": "yes"}
         assert "/run/talk/talk.sock" in unit
-    assert {each: values(unit, each) for each in settings} == {each: [value] for each, value in settings.items()}
+    assert {key: values(unit, key) for key in settings} == {key: [value] for key, value in settings.items()}
     assert not values(unit, "PrivateNetwork") + values(unit, "IPAddressDeny") + values(unit, "DeviceAllow")
     assert "\n[Install]\nWantedBy=" in unit
     flags = ["--no-text", "--homeassistant"]
-    command = command_of(printed(home, name, "--group", "a,b", *flags, "--insecure", "--socket", "/run/other"))
+    command = command_of(printed_unit(home, name, "--group", "a,b", *flags, "--insecure", "--socket", "/run/other"))
     assert os.path.isabs(command[0])
     assert command[-7:] == ["bridge", "--insecure", "--socket=/run/other", "--name=anna", "--group=a,b", *flags]
     assert command_of(unit)[-2:] == ["bridge", "--name=anna"]
 
 
 @pytest.mark.parametrize("name", ["user", "system"])
-def test_systemd_finds_nothing_wrong(home: str, name: str) -> None:
+def test_systemd_accepts_the_unit(home: str, name: str) -> None:
     needs("systemd-analyze")
     with open(f"{home}/talk-bridge.service", "w", encoding="utf-8") as file:
-        file.write(printed(home, name))
+        file.write(printed_unit(home, name))
     scope = ["--user"] if name == "user" else []
     done = run(
         ["systemd-analyze", *scope, "verify", "--man=no", f"{home}/talk-bridge.service"],
@@ -132,11 +130,11 @@ def test_systemd_finds_nothing_wrong(home: str, name: str) -> None:
     assert (done.code, done.err) == (0, ""), done
 
 
-def test_a_supervisor_is_told_the_state_with_and_without_a_broker(home: str, scripted: Talk, broker: Broker) -> None:
+def test_a_supervisor_gets_the_state_with_and_without_a_broker(home: str, scripted: Talk, broker: Broker) -> None:
     broker.kill()
     with Supervisor(f"{home}/n") as supervisor:
         own = {"NOTIFY_SOCKET": supervisor.address, "WATCHDOG_USEC": "1000000"}
-        command = command_of(printed(home, "system"))
+        command = command_of(printed_unit(home, "system"))
         with subprocess.Popen(
             command, env=scripted.env | broker.env() | own, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True
         ) as process:
@@ -162,9 +160,7 @@ def test_a_supervisor_is_told_the_state_with_and_without_a_broker(home: str, scr
             assert "Traceback" not in process.stderr.read()
 
 
-def test_the_bridge_uses_the_socket_that_is_named(
-    home: str, scripted: Talk, broker: Broker, make_bridge: MakeBridge
-) -> None:
+def test_the_bridge_uses_the_given_socket(home: str, scripted: Talk, broker: Broker, make_bridge: MakeBridge) -> None:
     with serving(environment(home, TALK_SOCKET=f"{home}/s")):
         make_bridge(scripted, broker, "berta", "--socket", f"{home}/s")
         with RemoteClient(broker) as client:

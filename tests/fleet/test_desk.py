@@ -1,4 +1,4 @@
-"""A command at a desk: the output that it has at the robot, its way there, and a broker that loses an answer."""
+"""Commands to one robot: their output compared with the robot's own, and faults of the broker."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ import pytest
 from talkcli import Client, Fleet, State
 from talkcli.cli.wait import CANCEL_TIMEOUT_S
 from talkcli.errors import Lost
-from tests.fleet.pretended import Pretended
+from tests.fleet.fake_robot import FakeRobot
+from tests.fleet.publish import SERVER, presence
 from tests.fleet.robot import LONG, Robot
-from tests.fleet.told import SERVER, presence
 from tests.support.bridge import Bridge, Desk, desk
 from tests.support.broker import Broker
 from tests.support.mqtt import Listener
@@ -35,13 +35,13 @@ if TYPE_CHECKING:
     from tests.support.processes import Clients, Finished, Process
 
 ALLOW = ("--allow", "say,cancel,status,wait,log,voices,pause,resume,set")
-#: The server's uptime, which differs between two commands.
+#: The server's uptime, which differs between commands.
 _UPTIME = re.compile(r'up \d+ s|"uptime": [\d.]+')
 
 
 @pytest.fixture(scope="module")
-def open_robot() -> Iterator[Robot]:
-    """A robot that allows all requests, and has spoken."""
+def permissive_robot() -> Iterator[Robot]:
+    """A robot that allows all requests. It has spoken a goal and rejected another."""
     with Broker() as broker, contextlib.closing(Talk(["--player", "null", "--rate", "450"])) as talk:
         with Bridge(talk, broker, "anna", *ALLOW) as bridge:
             bridge.await_online()
@@ -52,7 +52,7 @@ def open_robot() -> Iterator[Robot]:
         talk.stop()
 
 
-def told(done: Finished) -> tuple[int, str, str]:
+def comparable(done: Finished) -> tuple[int, str, str]:
     return done.code, _UPTIME.sub("", done.out), _UPTIME.sub("", done.err)
 
 
@@ -82,18 +82,18 @@ def told(done: Finished) -> tuple[int, str, str]:
         ("-q say --throttle 60 --key door hello", 0),
     ],
 )
-def test_a_command_has_the_same_output_as_at_the_robot(open_robot: Robot, line: str, code: int) -> None:
-    at_home = open_robot.talk.run(*line.split())
-    afar = open_robot.desk(*line.split())
-    open_robot.talk.request("resume")  # the other tests speak
-    assert told(afar) == told(at_home)
-    assert afar.code == code, afar
+def test_a_command_has_the_same_output_as_on_the_robot(permissive_robot: Robot, line: str, code: int) -> None:
+    local = permissive_robot.talk.run(*line.split())
+    remote = permissive_robot.desk(*line.split())
+    permissive_robot.talk.request("resume")  # other tests need a robot that isn't paused
+    assert comparable(remote) == comparable(local)
+    assert remote.code == code, remote
 
 
-def test_a_sentence_has_the_same_output_while_it_is_spoken(open_robot: Robot) -> None:
-    """Its id and the times of its words differ."""
+def test_a_sentence_has_the_same_output_while_it_is_spoken(permissive_robot: Robot) -> None:
+    """Only the id and the times of the words differ."""
     shown: list[tuple[int, str, str]] = []
-    for client in (open_robot.talk, Desk(open_robot.broker, env={"TALK_ROBOT": "anna"})):
+    for client in (permissive_robot.talk, Desk(permissive_robot.broker, env={"TALK_ROBOT": "anna"})):
         with contextlib.nullcontext(client) if isinstance(client, Talk) else client:
             for line, stdin in (("say -wf -- go on", None), ("say -w -", "go on\n")):
                 goal = f"goal-{len(shown)}"
@@ -103,35 +103,35 @@ def test_a_sentence_has_the_same_output_while_it_is_spoken(open_robot: Robot) ->
     assert shown[2:] == shown[:2]
 
 
-def test_watchers_at_both_ends_see_the_same(open_robot: Robot) -> None:
-    talk = open_robot.talk
-    with Desk(open_robot.broker) as somebody:
+def test_a_remote_watch_shows_the_same_events_as_a_local_one(permissive_robot: Robot) -> None:
+    talk = permissive_robot.talk
+    with Desk(permissive_robot.broker) as operator:
         watchers: list[tuple[Clients, Process]] = [
             (talk, talk.start("--json", "watch")),
-            (somebody, somebody.start("--robot", "anna", "--json", "watch")),
+            (operator, operator.start("--robot", "anna", "--json", "watch")),
         ]
         seen: list[list[str]] = []
-        for _, each in watchers:
-            assert each.stdout
-            seen.append([each.stdout.readline()])
+        for _, process in watchers:
+            assert process.stdout
+            seen.append([process.stdout.readline()])
         assert talk.run("say", "--wait", "--", "the door opens").code == 0
-        for (client, each), lines in zip(watchers, seen, strict=True):
-            assert each.stdout
+        for (client, process), lines in zip(watchers, seen, strict=True):
+            assert process.stdout
             while len(lines) == 1 or '"SUCCEEDED"' not in lines[-1]:
-                lines.append(each.stdout.readline())
-            each.send_signal(signal.SIGINT)
-            assert client.finish(each).code == 130
-    at_home, afar = seen
-    assert json.loads(afar[0]).keys() == json.loads(at_home[0]).keys()  # how many clients there are is another number
-    assert afar[1:] == at_home[1:]
-    assert len([each for each in afar if '"event": "word"' in each]) == 3
+                lines.append(process.stdout.readline())
+            process.send_signal(signal.SIGINT)
+            assert client.finish(process).code == 130
+    local, remote = seen
+    assert json.loads(remote[0]).keys() == json.loads(local[0]).keys()  # the number of clients differs
+    assert remote[1:] == local[1:]
+    assert len([line for line in remote if '"event": "word"' in line]) == 3
 
 
-def test_lines_are_spoken_in_their_order_also_if_there_are_more_than_may_wait(robot: Robot) -> None:
+def test_lines_are_spoken_in_order_even_if_they_exceed_the_queue(robot: Robot) -> None:
     lines = [f"length=0.01 {n}" for n in range(25)]
-    for words in (["--wait"], []):
-        with Desk(robot.broker) as somebody:
-            done = somebody.run("--robot", "anna", "say", "--lines", *words, stdin="\n".join(lines))
+    for options in (["--wait"], []):
+        with Desk(robot.broker) as operator:
+            done = operator.run("--robot", "anna", "say", "--lines", *options, stdin="\n".join(lines))
         assert (done.code, len(done.out.splitlines())) == (0, len(lines)), done
     assert robot.talk.run("wait").code == 0
     assert robot.talk.watcher.texts("SUCCEEDED") == lines * 2
@@ -140,17 +140,17 @@ def test_lines_are_spoken_in_their_order_also_if_there_are_more_than_may_wait(ro
 def test_lines_time_out_while_the_queue_is_full(robot: Robot) -> None:
     lines = [LONG, *(f"{n}" for n in range(100))]
     assert robot.talk.run("say", "--lines", "--ahead", "101", stdin="\n".join(lines)).code == 0
-    with Desk(robot.broker) as somebody:
-        done = somebody.run("--robot", "anna", "say", "--lines", "--wait", "--timeout", "2", stdin="one\ntwo\n")
+    with Desk(robot.broker) as operator:
+        done = operator.run("--robot", "anna", "say", "--lines", "--wait", "--timeout", "2", stdin="one\ntwo\n")
     assert done.code == 124, done
     assert "line 1 may not have been accepted" in done.err
     assert "timed out after 2 s" in done.err
     robot.talk.run("cancel")
 
 
-def test_ctrl_c_cancels_the_lines_that_were_sent_however_long_ago_the_command_began(robot: Robot) -> None:
-    with Desk(robot.broker) as somebody:
-        client = somebody.start("--robot", "anna", "say", "--lines", "--wait", stdin=subprocess.PIPE)
+def test_ctrl_c_cancels_lines_of_a_command_that_has_run_for_a_while(robot: Robot) -> None:
+    with Desk(robot.broker) as operator:
+        client = operator.start("--robot", "anna", "say", "--lines", "--wait", stdin=subprocess.PIPE)
         assert client.stdin
         assert client.stdout
         client.stdin.write("never-ends words=1\nsecond\n")
@@ -159,13 +159,13 @@ def test_ctrl_c_cancels_the_lines_that_were_sent_however_long_ago_the_command_be
         robot.talk.watcher.wait_for_word(ids[0])
         time.sleep(CANCEL_TIMEOUT_S)
         client.send_signal(signal.SIGINT)
-        done = somebody.finish(client)
+        done = operator.finish(client)
     assert (done.code, "not known" in done.err) == (130, False), done
-    assert [robot.talk.watcher.wait_for_terminal(each) for each in ids] == ["PREEMPTED", "RECALLED"]
+    assert [robot.talk.watcher.wait_for_terminal(goal_id) for goal_id in ids] == ["PREEMPTED", "RECALLED"]
 
 
 @pytest.mark.parametrize(
-    ("line", "words"),
+    ("line", "expected"),
     [
         ("--robot anna say hello", "TALK_BROKER is not set"),
         ("--robot anna --socket /tmp/s status", "leave out one of them"),
@@ -178,100 +178,100 @@ def test_ctrl_c_cancels_the_lines_that_were_sent_however_long_ago_the_command_be
         ("--robot= status", "empty"),
     ],
 )
-def test_a_line_that_can_mean_no_robot_is_a_usage_error(lasting_robot: Robot, line: str, words: str) -> None:
-    with Desk(lasting_robot.broker, env={"TALK_BROKER": ""} if "TALK_BROKER" in words else {}) as somebody:
-        done = somebody.run(*line.split())
+def test_a_command_that_no_robot_can_run_is_a_usage_error(shared_robot: Robot, line: str, expected: str) -> None:
+    with Desk(shared_robot.broker, env={"TALK_BROKER": ""} if "TALK_BROKER" in expected else {}) as operator:
+        done = operator.run(*line.split())
     assert (done.code, done.out) == (2, ""), done
-    assert words in done.err
+    assert expected in done.err
 
 
-def test_markdown_is_only_sent_to_a_robot_whose_server_takes_it(lasting_robot: Robot) -> None:
-    done = lasting_robot.desk("say", "-w", "--markdown", "--id", "marked", "length=0 **hello**")
-    assert (done.code, lasting_robot.talk.goal("marked")["format"]) == (0, "markdown"), done
+def test_markdown_is_only_sent_to_a_robot_whose_server_supports_it(shared_robot: Robot) -> None:
+    done = shared_robot.desk("say", "-w", "--markdown", "--id", "marked", "length=0 **hello**")
+    assert (done.code, shared_robot.talk.goal("marked")["format"]) == (0, "markdown"), done
     refused = "old-1: the server is 0.1.0 and can't take Markdown: restart it\n"
-    with Pretended(lasting_robot.broker, "old-1", lambda _: []) as robot, Desk(lasting_robot.broker) as somebody:
+    with FakeRobot(shared_robot.broker, "old-1", lambda _: []) as robot, Desk(shared_robot.broker) as operator:
         presence(robot, "old-1", server={**SERVER, "features": []})
-        done = somebody.run("--robot", "old-1", "say", "--markdown", "**hello**")
+        done = operator.run("--robot", "old-1", "say", "--markdown", "**hello**")
         assert (done.code, done.out, done.err) == (9, "", f"talk: {refused}"), done
-        done = somebody.run("--robot", "old-*", "say", "--markdown", "**hello**")
+        done = operator.run("--robot", "old-*", "say", "--markdown", "**hello**")
         assert (done.code, refused.removeprefix("old-1: ") in done.err) == (9, True), done
 
 
-def test_a_robot_is_asked_and_never_this_machine(broker: Broker) -> None:
-    """Plain lines, which are sent before anything is imported, and others."""
+def test_a_command_for_a_robot_never_reaches_the_local_server(broker: Broker) -> None:
+    """This includes simple commands, which are sent before most modules are imported."""
     with short_directory() as home, socket.socket(socket.AF_UNIX) as local:
         local.bind(f"{home}/s")
         local.listen()
         local.setblocking(False)
-        for words, env in ((["--robot", "nobody"], {}), ([], {"TALK_ROBOT": "nobody"})):
-            with Desk(broker, env={"TALK_SOCKET": f"{home}/s", **env}) as somebody:
+        for options, env in ((["--robot", "nobody"], {}), ([], {"TALK_ROBOT": "nobody"})):
+            with Desk(broker, env={"TALK_SOCKET": f"{home}/s", **env}) as operator:
                 lines = ("say hello", "say -w hello", "cancel", "--json status", "watch")
-                for each in [somebody.start(*words, *line.split()) for line in lines]:
-                    done = somebody.finish(each)
+                for client in [operator.start(*options, *line.split()) for line in lines]:
+                    done = operator.finish(client)
                     assert (done.code, "no robot 'nobody'" in done.err) == (3, True), done
-        with pytest.raises(BlockingIOError):  # nobody has connected
+        with pytest.raises(BlockingIOError):  # no command has connected
             local.accept()
 
 
-def test_an_option_goes_before_a_variable_and_a_robot_before_a_socket(open_robot: Robot) -> None:
-    variables = {"TALK_SOCKET": open_robot.talk.socket, "TALK_ROBOT": "nobody"}
-    with Desk(open_robot.broker, env=variables) as somebody:
-        assert somebody.run("status").code == 3
-        assert somebody.run("--robot", "anna", "status").code == 0
-        assert somebody.run("--socket", open_robot.talk.socket, "status").code == 0
-    with Desk(open_robot.broker, env=variables | {"TALK_BROKER": ""}) as somebody:
-        assert somebody.run("--socket", open_robot.talk.socket, "say", "--wait", "hello").code == 0
+def test_options_override_variables_and_a_robot_overrides_a_socket(permissive_robot: Robot) -> None:
+    variables = {"TALK_SOCKET": permissive_robot.talk.socket, "TALK_ROBOT": "nobody"}
+    with Desk(permissive_robot.broker, env=variables) as operator:
+        assert operator.run("status").code == 3
+        assert operator.run("--robot", "anna", "status").code == 0
+        assert operator.run("--socket", permissive_robot.talk.socket, "status").code == 0
+    with Desk(permissive_robot.broker, env=variables | {"TALK_BROKER": ""}) as operator:
+        assert operator.run("--socket", permissive_robot.talk.socket, "say", "--wait", "hello").code == 0
 
 
-def offered(robot: Robot, line: str, **env: str) -> list[str]:
-    """Return the values that fish offers at the end of a line."""
-    asked = {"_TALK_COMPLETE": "fish_complete", "COMP_WORDS": line, "COMP_CWORD": ""}
-    with Desk(robot.broker, env={**env, **asked}) as somebody:
-        done = somebody.run()
+def completions(robot: Robot, line: str, **env: str) -> list[str]:
+    """Return the completions of a command line in fish."""
+    variables = {"_TALK_COMPLETE": "fish_complete", "COMP_WORDS": line, "COMP_CWORD": ""}
+    with Desk(robot.broker, env={**env, **variables}) as operator:
+        done = operator.run()
     assert done.err == "", done
-    return [each.removeprefix("plain,").partition("\t")[0] for each in done.out.splitlines() if each]
+    return [line.removeprefix("plain,").partition("\t")[0] for line in done.out.splitlines() if line]
 
 
-def test_completion_offers_the_robots_that_are_online_and_their_goals(robot: Robot) -> None:
+def test_completion_offers_online_robots_and_their_goals(robot: Robot) -> None:
     with Listener(robot.broker) as publisher:
         presence(publisher, "bert")
         presence(publisher, "carl", online=False)
     assert robot.talk.run("say", "--id", "mine", "--", LONG).code == 0
-    assert offered(robot, "talk --robot ") == ["anna", "bert", "@all"]
-    assert offered(robot, "talk fleet status --robot @") == ["@all"]
-    assert offered(robot, "talk --robot anna wait ") == ["mine"]
-    assert offered(robot, "talk wait m", TALK_ROBOT="anna") == ["mine"]
-    assert offered(robot, "talk --robot carl wait ") == []
+    assert completions(robot, "talk --robot ") == ["anna", "bert", "@all"]
+    assert completions(robot, "talk fleet status --robot @") == ["@all"]
+    assert completions(robot, "talk --robot anna wait ") == ["mine"]
+    assert completions(robot, "talk wait m", TALK_ROBOT="anna") == ["mine"]
+    assert completions(robot, "talk --robot carl wait ") == []
     robot.broker.kill()
-    assert offered(robot, "talk --robot ") == []
+    assert completions(robot, "talk --robot ") == []
     robot.broker.start()
 
 
-# A broker that takes less than it should, or loses an answer
+# A broker that limits messages or loses a reply
 
 
-#: Longer than the broker takes, shorter than a robot takes.
+#: Too long for the broker, but not for a robot.
 TOO_LONG = "word " * 1_200
 
 
 @pytest.fixture
-def client(lasting_robot: Robot) -> Iterator[Client]:
-    """A client of the robot in this process."""
-    with Fleet(lasting_robot.broker.url).robot("anna") as client:
+def client(shared_robot: Robot) -> Iterator[Client]:
+    """A `Client` of the robot."""
+    with Fleet(shared_robot.broker.url).robot("anna") as client:
         yield client
 
 
-def test_a_sentence_that_the_broker_does_not_take_is_refused_before_it_is_sent(make_talk: MakeTalk) -> None:
+def test_a_text_too_long_for_the_broker_is_refused_before_it_is_sent(make_talk: MakeTalk) -> None:
     with Broker(max_packet=4096) as broker, Bridge(make_talk(scripted=True), broker, "anna") as bridge:
         bridge.await_online()
         done = desk(broker, "anna", "say", "--wait", "--", TOO_LONG)
         assert (done.code, done.out) == (1, "")
         assert "the broker accepts at most 3,072; nothing was sent" in done.err
-        with Desk(broker, env={"TALK_MQTT_USER": "o" * 59}) as somebody:  # a name as long as may be
-            assert somebody.run("--robot", "anna", "say", "--wait", "--rate", "450", "--", "short").code == 0
+        with Desk(broker, env={"TALK_MQTT_USER": "o" * 59}) as operator:  # the longest allowed name
+            assert operator.run("--robot", "anna", "say", "--wait", "--rate", "450", "--", "short").code == 0
 
 
-def test_a_cancel_whose_answer_is_lost_ends_nothing_that_came_later(robot: Robot) -> None:
+def test_a_cancel_whose_reply_is_lost_does_not_affect_later_goals(robot: Robot) -> None:
     robot.talk.request("pause")
     robot.talk.run("say", "--id", "old", "old")
     with (
@@ -281,13 +281,13 @@ def test_a_cancel_whose_answer_is_lost_ends_nothing_that_came_later(robot: Robot
     ):
         with Listener(robot.broker, "talk/reply/+/+/anna") as listener:
             proxy.hold("to_client")
-            asked = thread.submit(client.cancel)
-            listener.await_message(lambda each: b'"count": 1' in each.payload)
+            future = thread.submit(client.cancel)
+            listener.await_message(lambda message: b'"count": 1' in message.payload)
         robot.talk.run("say", "--id", "new", "new")
         proxy.cut()
         proxy.release()
         with pytest.raises(Lost, match="it may have been carried out"):
-            asked.result(30)
+            future.result(30)
         assert client.goal("old").state is State.RECALLED
         assert client.goal("new").state is State.PENDING
 
@@ -295,14 +295,14 @@ def test_a_cancel_whose_answer_is_lost_ends_nothing_that_came_later(robot: Robot
 def test_a_goal_may_be_sent_from_several_threads(client: Client) -> None:
     fields: dict[str, Any] = {"ttl": 60, "data": {"number": [1]}, "id": "the-same", "follow": False}
     with ThreadPoolExecutor(4) as threads:
-        said = [threads.submit(client.say, "a", **fields) for _ in range(20)]
-    handles = [each.result() for each in said]
-    assert {each.id for each in handles} == {"the-same"}
-    assert sum(not each.attached for each in handles) == 1
+        futures = [threads.submit(client.say, "a", **fields) for _ in range(20)]
+    handles = [future.result() for future in futures]
+    assert {handle.id for handle in handles} == {"the-same"}
+    assert sum(not handle.attached for handle in handles) == 1
 
 
-@pytest.mark.slow  # a broker doesn't tell that it keeps something back, so the whole patience of 5 s is waited for
-def test_a_login_that_may_not_read_answers_is_told_before_anything_is_sent(make_talk: MakeTalk) -> None:
+@pytest.mark.slow  # a broker doesn't report withheld messages, so the desk waits for its limit of 5 s
+def test_a_login_that_may_not_read_replies_is_refused_before_sending(make_talk: MakeTalk) -> None:
     rules = "user anna\ntopic readwrite #\n\nuser olga\ntopic write talk/#\ntopic read talk/robot/+/presence\n"
     with (
         Broker(users={"anna": "a", "olga": "b"}, acl=rules) as broker,
@@ -315,7 +315,7 @@ def test_a_login_that_may_not_read_answers_is_told_before_anything_is_sent(make_
         assert (log.code, log.out) == (0, "")
 
 
-def test_a_child_that_closes_its_copy_leaves_the_connection_to_its_parent(client: Client) -> None:
+def test_a_forked_child_can_close_its_copy_of_a_client(client: Client) -> None:
     child = os.fork()
     if child == 0:
         client.close()

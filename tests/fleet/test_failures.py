@@ -1,4 +1,4 @@
-"""Requests that must not be spoken or obeyed: to a robot that is away, sent twice, retained, malformed, alien."""
+"""Requests to missing robots or brokers, and repeated, retained, malformed and malicious requests."""
 
 from __future__ import annotations
 
@@ -30,40 +30,40 @@ if TYPE_CHECKING:
     from tests.support.broker import Broker
     from tests.support.processes import Finished, Talk
 
-#: Seconds in which a desk knows that a robot is not there.
+#: Seconds until a desk reports that a robot is missing.
 AT_ONCE = 1.0
-#: Bytes of a request's line at most, its end included.
+#: Maximum size of a request's line in bytes, with its line end.
 LONGEST_LINE = 64 * 1024
 
 
-def assert_refused(done: Finished, code: int, words: str) -> None:
+def assert_refused(done: Finished, code: int, expected: str) -> None:
     assert (done.code, done.out) == (code, ""), done
-    assert words in done.err, done
+    assert expected in done.err, done
 
 
 def assert_spoken(robot: Robot, *texts: str) -> None:
-    """Assert that these texts were spoken, and no other that was sent before the control."""
+    """Assert that exactly these texts were spoken before a control text."""
     assert robot.desk("say", "--wait", "control").code == 0
     assert robot.spoken == [*texts, "control"]
 
 
-def test_a_robot_that_is_offline_is_told_at_once_and_speaks_nothing_of_it_when_it_comes(robot: Robot) -> None:
+def test_an_offline_robot_is_reported_at_once_and_never_gets_the_goal(robot: Robot) -> None:
     assert robot.bridge.terminate() == 0
     with limits():
-        for name, words in (("anna", "anna is offline, so nothing was sent"), ("nobody", "no robot 'nobody' is known")):
-            done = desk(robot.broker, name, "say", "--wait", "nobody hears this")
-            assert_within(done.seconds, AT_ONCE, "a say to a robot that is not there")
-            assert_refused(done, 3, words)
-    with RemoteClient(robot.broker, "olga") as olga:  # which doesn't look first
-        olga.post("say", text="nor this")
-        olga.send("nor that", kind="say", response=None)
+        for name, error in (("anna", "anna is offline, so nothing was sent"), ("nobody", "no robot 'nobody' is known")):
+            done = desk(robot.broker, name, "say", "--wait", "not sent")
+            assert_within(done.seconds, AT_ONCE, "a say to a missing robot")
+            assert_refused(done, 3, error)
+    with RemoteClient(robot.broker, "olga") as olga:  # sends without checking the presence
+        olga.post("say", text="not spoken")
+        olga.send("not spoken either", kind="say", response=None)
         robot.bridge.start()
         robot.bridge.await_online()
         assert_spoken(robot)
         assert olga.lines == []
 
 
-def test_a_broker_that_is_not_there_is_told_and_nothing_is_spoken_when_it_is_back(robot: Robot) -> None:
+def test_a_missing_broker_is_reported_and_never_gets_the_goal(robot: Robot) -> None:
     robot.broker.kill()
     assert_refused(robot.desk("say", "hello"), 3, f"can't connect to the broker at {robot.broker.url}")
     robot.broker.start()
@@ -72,10 +72,10 @@ def test_a_broker_that_is_not_there_is_told_and_nothing_is_spoken_when_it_is_bac
 
 
 @in_loop
-async def test_a_connection_that_breaks_under_an_answer_is_made_again(
+async def test_a_bridge_reconnects_if_it_is_disconnected_while_it_replies(
     scripted: Talk, broker: Broker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The request was read, and the answer can't be sent while the bridge still waits for room for it."""
+    """The request was received, but its reply can't be sent while the bridge waits for room in the socket."""
     bugs: list[object] = []
     original = paho.Client._sock_send
 
@@ -84,11 +84,11 @@ async def test_a_connection_that_breaks_under_an_answer_is_made_again(
             raise ConnectionResetError
         return original(client, data)
 
-    async def until(wanted: Callable[[], bool]) -> None:
-        while not wanted():  # noqa: ASYNC110 - a bridge tells nobody
+    async def until(condition: Callable[[], bool]) -> None:
+        while not condition():  # noqa: ASYNC110 - a bridge has no event for this
             await asyncio.sleep(0.01)
 
-    asyncio.get_running_loop().set_exception_handler(lambda _loop, told: bugs.append(told))
+    asyncio.get_running_loop().set_exception_handler(lambda _loop, context: bugs.append(context))
     settings = BridgeSettings("anna", ("say",), socket=scripted.socket)
     bridge = Bridge(settings, lambda: brokers.from_environment(broker.env()))
     work = asyncio.create_task(bridge.run())
@@ -96,10 +96,10 @@ async def test_a_connection_that_breaks_under_an_answer_is_made_again(
     with RemoteClient(broker, "olga") as olga, Listener(broker, "talk/robot/anna/presence") as listener:
         monkeypatch.setattr(paho.Client, "_sock_send", send)
         olga.send({"seq": 1, "request": "set", "rate": 200})
-        gone = await asyncio.to_thread(listener.await_message, lambda each: not each.json["online"], PATIENCE)
-        # Once the broker has passed on the new presence, it has processed the robot's subscriptions, too.
+        gone = await asyncio.to_thread(listener.await_message, lambda message: not message.json["online"], PATIENCE)
+        # If the broker forwards the new presence, it has also processed the robot's subscriptions.
         await asyncio.to_thread(
-            listener.await_message, lambda each: each.json["online"] and each.arrived > gone.arrived, PATIENCE
+            listener.await_message, lambda message: message.json["online"] and message.arrived > gone.arrived, PATIENCE
         )
         olga.send({"seq": 2, "request": "say", "text": "hello"})
         assert (await asyncio.to_thread(olga.reply, 2))["ok"]
@@ -117,19 +117,19 @@ def test_a_cancel_arrives_after_a_flood(robot: Robot) -> None:
         robot.bridge.resume_process()
         end = time.monotonic() + PATIENCE
         while not olga.lines:  # the broker drops messages until its queue has room again
-            assert time.monotonic() < end, "no cancel is answered"
+            assert time.monotonic() < end, "no cancel got a reply"
             olga.post("cancel")
             olga.listener.find(lambda _: bool(olga.lines), 0.1)
 
 
-def test_a_goal_that_comes_several_times_is_spoken_once(robot: Robot) -> None:
+def test_a_goal_that_arrives_several_times_is_spoken_once(robot: Robot) -> None:
     line = '{"seq": %d, "request": "say", "id": "once", "text": "only once"}'
     with RemoteClient(robot.broker, "olga") as olga:
         for seq in (1, 2, 3):
             olga.send(line % seq)
         olga.send(line % 4, to="talk/group/all")
         replies = [olga.reply(seq) for seq in (1, 2, 3, 4)]
-    assert [(each["ok"], each["goal"]["id"], each.get("attached", False)) for each in replies] == [
+    assert [(reply["ok"], reply["goal"]["id"], reply.get("attached", False)) for reply in replies] == [
         (True, "once", False),
         *[(True, "once", True)] * 3,
     ]
@@ -138,22 +138,22 @@ def test_a_goal_that_comes_several_times_is_spoken_once(robot: Robot) -> None:
     assert robot.spoken == ["only once"]
 
 
-@pytest.mark.parametrize("bridge", ["the same", "another"])
-def test_a_goal_that_an_earlier_server_had_is_not_sent_to_the_next(robot: Robot, bridge: str) -> None:
+@pytest.mark.parametrize("bridge", ["same", "restarted"])
+def test_a_goal_of_an_earlier_server_is_not_sent_to_the_next(robot: Robot, bridge: str) -> None:
     assert robot.desk("say", "--wait", "--id", "mine", "only once").code == 0
-    if bridge == "another":
+    if bridge == "restarted":
         robot.bridge.kill()
         robot.bridge.start()
-        robot.bridge.await_online()  # it has asked the server what was said
+        robot.bridge.await_online()  # it has requested the server's log
     robot.talk.kill()
     robot.talk.start_server()
     with robot.listen() as listener:
-        listener.await_message(lambda each: robot.is_online(each) and each.json["server"]["pid"] == robot.talk.pid)
+        listener.await_message(robot.has_current_server)
     assert_refused(robot.desk("say", "--id", "mine", "only once"), 12, "it may have been spoken")
     assert_spoken(robot)
 
 
-def test_a_retained_message_is_dropped_as_it_comes(robot: Robot) -> None:
+def test_a_new_retained_message_is_dropped(robot: Robot) -> None:
     robot.talk.run("say", "--id", "mine", "--", LONG)
     robot.talk.watcher.wait_for("mine", "ACTIVE")
     with RemoteClient(robot.broker, "olga") as olga:
@@ -162,14 +162,12 @@ def test_a_retained_message_is_dropped_as_it_comes(robot: Robot) -> None:
             olga.send(text, retain=True, kind=kind, response=None)
         assert olga.ask("status", id="mine")["goal"]["state"] == "ACTIVE"
         assert olga.ask("cancel")["ok"]
-        assert not [each for each in olga.lines if each.get("seq") == 99]
+        assert not [line for line in olga.lines if line.get("seq") == 99]
     assert "retained" in robot.bridge.log
     assert_spoken(robot, LONG)
 
 
-def test_a_message_that_the_broker_has_kept_is_not_spoken(
-    make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge
-) -> None:
+def test_an_old_retained_message_is_not_spoken(make_talk: MakeTalk, broker: Broker, make_bridge: MakeBridge) -> None:
     talk = make_talk(scripted=True)
     talk.run("say", "--id", "mine", "--", LONG)
     with RemoteClient(broker, "olga") as olga:
@@ -185,33 +183,33 @@ def test_a_message_that_the_broker_has_kept_is_not_spoken(
         assert olga.lines == []
 
 
-def test_a_malformed_request_is_answered_with_the_error_of_the_wire(lasting_robot: Robot) -> None:
-    """`tests/unit/test_fleet_policy.py` has all of these errors."""
+def test_a_malformed_request_gets_the_protocols_error(shared_robot: Robot) -> None:
+    """The other errors are in `tests/unit/test_fleet_policy.py`."""
     status = b'{"seq": 7, "request": "status"}'
-    before = lasting_robot.spoken
-    with RemoteClient(lasting_robot.broker, "olga") as olga:
+    before = shared_robot.spoken
+    with RemoteClient(shared_robot.broker, "olga") as olga:
         olga.send(status.ljust(LONGEST_LINE - 1))
         assert olga.reply(7)["ok"]
         for payload, code in ((b'["say", "hello"]', "bad_json"), (status.ljust(LONGEST_LINE), "line_too_long")):
             olga.send(payload)
-            assert olga.line(lambda each: each.get("ok") is False and each["error"]["code"] == code)  # noqa: B023
-        assert olga.ask("status")["ok"]  # it goes on
-    assert lasting_robot.spoken == before
+            assert olga.line(lambda line: line.get("ok") is False and line["error"]["code"] == code)  # noqa: B023
+        assert olga.ask("status")["ok"]  # the bridge still works
+    assert shared_robot.spoken == before
 
 
-def test_a_desk_may_do_what_the_robot_allows_and_nothing_else(make_robot: MakeRobot) -> None:
+def test_a_robot_accepts_only_allowed_requests(make_robot: MakeRobot) -> None:
     anna = make_robot("anna")
-    assert_refused(anna.desk("set", "--rate", "300"), 10, "anna: remote clients may not use set on this robot")
+    assert_refused(anna.desk("set", "--rate", "300"), 10, "anna: this robot's bridge does not allow set requests")
     bert = make_robot("bert", "--allow", "say,set")
     assert bert.bridge.await_online()["allow"] == ["say", "set"]
     assert bert.desk("set", "--rate", "300").code == 0
     assert bert.talk.request("set")["settings"]["rate"] == 300
-    for each in ("cancel", "status"):
-        assert_refused(bert.desk(each), 10, f"bert: remote clients may not use {each} on this robot")
+    for request in ("cancel", "status"):
+        assert_refused(bert.desk(request), 10, f"bert: this robot's bridge does not allow {request} requests")
     assert bert.desk("say", "hello").code == 0
 
 
-# Strangers
+# Malicious clients
 
 
 EVIL = "\x1b[31m\x07"
@@ -227,22 +225,22 @@ TEXTS = (
 
 
 def is_plain(log: str) -> bool:
-    """Return whether a log has nothing in it that a terminal would obey."""
-    return all(each == "\n" or each.isprintable() for each in log)
+    """Return whether a log contains no control characters."""
+    return all(char == "\n" or char.isprintable() for char in log)
 
 
-def test_a_plain_text_is_spoken_as_it_stands_and_no_log_has_control_characters(robot: Robot) -> None:
+def test_plain_text_is_spoken_verbatim_and_logged_without_control_chars(robot: Robot) -> None:
     talk, watcher = robot.talk, robot.talk.watcher
     before = talk.request("set")["settings"]
     with RemoteClient(robot.broker, "olga") as olga:
-        for each in TEXTS:
-            olga.send(each, kind="say", response=None)
+        for text in TEXTS:
+            olga.send(text, kind="say", response=None)
         watcher.wait_until(lambda _: len(watcher.texts("PENDING")) == len(TEXTS))
         assert watcher.texts("PENDING") == list(TEXTS)
-        assert {talk.goal(each)["client"]["name"] for each in watcher.goals()} == {"mqtt:olga"}
-        olga.send("\x1b[31m--key no such", kind="cancel", response=None)  # any payload cancels everything
-        for each in watcher.goals():
-            watcher.wait_for_terminal(each)
+        assert {talk.goal(goal_id)["client"]["name"] for goal_id in watcher.goals()} == {"mqtt:olga"}
+        olga.send("\x1b[31m--key no such", kind="cancel", response=None)  # any payload cancels all goals
+        for text in watcher.goals():
+            watcher.wait_for_terminal(text)
         for request in (
             {"request": EVIL},
             {"request": "say", "text": "x", EVIL: 1},
@@ -263,58 +261,60 @@ def test_a_plain_text_is_spoken_as_it_stands_and_no_log_has_control_characters(r
     assert is_plain(talk.log), talk.log
 
 
-def test_a_robot_publishes_nothing_on_the_response_topic_of_another(lasting_robot: Robot) -> None:
-    """`tests/unit/test_fleet_topics.py` has all forms of such topics."""
+def test_a_robot_does_not_publish_on_the_response_topic_of_another_user(shared_robot: Robot) -> None:
+    """The other forms of such topics are in `tests/unit/test_fleet_topics.py`."""
     responses = {"talk/reply/otto/session/anna", "talk/robot/bert/say/olga", "elsewhere"}
-    before = lasting_robot.spoken
-    with Listener(lasting_robot.broker, "#") as everything, RemoteClient(lasting_robot.broker, "olga") as olga:
-        for each in responses:
-            olga.send({"request": "say", "text": "hello"}, response=each)
+    before = shared_robot.spoken
+    with Listener(shared_robot.broker, "#") as everything, RemoteClient(shared_robot.broker, "olga") as olga:
+        for topic in responses:
+            olga.send({"request": "say", "text": "hello"}, response=topic)
         assert olga.ask("status")["ok"]
-        assert not responses & {each.topic for each in everything.messages}
-    assert lasting_robot.spoken == before
+        assert not responses & {message.topic for message in everything.messages}
+    assert shared_robot.spoken == before
 
 
 def test_with_no_text_only_the_remote_client_reads_a_sentence(broker: Broker, make_robot: MakeRobot) -> None:
     robot = make_robot("anna", "--no-text")
     with (
-        Listener(broker, "talk/robot/anna/+", "talk/robot/anna/event/+") as everybody,
+        Listener(broker, "talk/robot/anna/+", "talk/robot/anna/event/+") as listener,
         RemoteClient(broker, "olga") as olga,
     ):
         goal = olga.say("never-ends se", more=True)
         assert olga.ask("append", id=goal["id"], text="cret word")["ok"]
-        everybody.await_message(lambda each: each.topic.endswith("/status") and each.json["active"] == goal["id"])
+        listener.await_message(
+            lambda message: message.topic.endswith("/status") and message.json["active"] == goal["id"]
+        )
         assert olga.ask("cancel")["count"] == 1
         done = robot.desk("say", "--wait", "--feedback", "--key", "door", "the secret word")
         assert (done.code, "secret" in done.out) == (0, True), done
         assert robot.talk.run("say", "--wait", "--key", "door", "another secret").code == 0
-        everybody.await_message(lambda each: each.topic.endswith("/state") and each.json["state"] == "SUCCEEDED")
-        everybody.await_message(lambda each: each.topic.endswith("/status") and "SUCCEEDED" in each.text)
-        told = everybody.messages
-    assert {each.topic.rpartition("/")[2] for each in told} >= {"state", "status", "presence"}
-    assert [each for each in told if "secret" in each.text] == []
+        listener.await_message(lambda event: event.topic.endswith("/state") and event.json["state"] == "SUCCEEDED")
+        listener.await_message(lambda message: message.topic.endswith("/status") and "SUCCEEDED" in message.text)
+        messages = listener.messages
+    assert {message.topic.rpartition("/")[2] for message in messages} >= {"state", "status", "presence"}
+    assert [message for message in messages if "secret" in message.text] == []
 
 
 @pytest.mark.timeout(20)
-def test_broker_that_dies_while_it_is_answered_ends_the_connection(broker: Broker) -> None:
-    """The answer is sent from the callback, which must not wait for a broker that is gone."""
+def test_a_broker_that_dies_during_a_reply_ends_the_connection(broker: Broker) -> None:
+    """The reply is sent by a callback, which must not wait for a broker that is gone."""
     needs_packages("paho")
     from talkcli.fleet.link import Link
 
-    heard = []
+    received = []
 
-    def hear(message: Message) -> None:
-        heard.append(message.payload)
+    def receive(message: Message) -> None:
+        received.append(message.payload)
         broker.kill()
-        for _ in range(3):  # the first is answered by a reset, which the next one finds
+        for _ in range(3):  # the broker's host resets the connection, which the next attempt notices
             link.publish(Message("an/answer", b"answer"))
 
-    link = Link(brokers.from_environment(broker.env()), "somebody", hear)
+    link = Link(brokers.from_environment(broker.env()), "somebody", receive)
     link.open()
     link.subscribe("a/question", retained=False)
     link.publish(Message("a/question", b"question"))
     while link.ended is None:
-        assert select.select([link.fileno()], [], [], 10)[0], "the broker tells nothing"
+        assert select.select([link.fileno()], [], [], 10)[0], "the connection did not end"
         link.read()
-    assert heard == [b"question"]
+    assert received == [b"question"]
     assert link.ended == "the connection was lost"

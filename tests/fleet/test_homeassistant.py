@@ -1,4 +1,4 @@
-"""A robot as a device of Home Assistant's, with a real robot and broker; see `tests.fleet.homeassistant`."""
+"""A robot as a device of Home Assistant, with a real robot and broker (see `tests.fleet.homeassistant`)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tests.fleet.conftest import MakeBridge, MakeRobot
 
 ANNA = "homeassistant/device/talk/anna/config"
-#: The name r2.d2 has a dot, so its topic has another form.
+#: The topic for the name r2.d2. A dot is not allowed in such a topic.
 DOTTED = "homeassistant/device/talk-dots/r2_dd2/config"
 
 
@@ -26,7 +26,7 @@ def announced(make_robot: MakeRobot) -> Robot:
     return make_robot("anna", "--homeassistant")
 
 
-def test_a_message_is_spoken_and_the_entities_show_how_it_ends(announced: Robot) -> None:
+def test_a_message_is_spoken_and_the_entities_show_its_state(announced: Robot) -> None:
     with HomeAssistant(announced.broker) as home:
         device = home.device()
         home.await_states(device, state="idle")
@@ -39,35 +39,37 @@ def test_a_message_is_spoken_and_the_entities_show_how_it_ends(announced: Robot)
     assert announced.spoken == [LONG, '{"request": "cancel"}']
 
 
-def test_the_announcement_is_retained_and_repeated_once_home_assistant_has_started(announced: Robot) -> None:
+def test_the_announcement_is_repeated_when_home_assistant_starts(announced: Robot) -> None:
     with HomeAssistant(announced.broker) as home:
-        kept = home.await_message(lambda each: each.topic == ANNA)
+        kept = home.await_message(lambda message: message.topic == ANNA)
         home.publish(*BIRTH)
-        home.await_message(lambda each: each is not kept)
-        told = home.messages
-    assert [(each.payload, each.retain, each.qos, each.expiry) for each in told] == [(kept.payload, True, 1, None)] * 2
+        home.await_message(lambda message: message is not kept)
+        messages = home.messages
+    assert [(message.payload, message.retain, message.qos, message.expiry) for message in messages] == [
+        (kept.payload, True, 1, None)
+    ] * 2
 
 
 @pytest.mark.slow
-def test_several_starts_within_seconds_are_answered_once(announced: Robot) -> None:
+def test_several_starts_within_seconds_cause_one_announcement(announced: Robot) -> None:
     with HomeAssistant(announced.broker) as home:
-        seen = [home.await_message(lambda each: each.topic == ANNA)]
+        seen = [home.await_message(lambda message: message.topic == ANNA)]
         home.publish(BIRTH[0], "offline")
         for births in (5, 1):
             for _ in range(births):
                 home.publish(*BIRTH)
-            seen.append(home.await_message(lambda each: each not in seen))
+            seen.append(home.await_message(lambda message: message not in seen))
         assert home.messages == seen
 
 
-def test_a_broker_that_has_forgotten_the_device_is_told_again(announced: Robot) -> None:
+def test_a_device_is_announced_again_to_a_broker_that_has_forgotten_it(announced: Robot) -> None:
     announced.broker.kill()
     announced.broker.start()
     with HomeAssistant(announced.broker) as home:
         home.await_states(home.device(), state="idle")
 
 
-def test_a_device_is_unavailable_without_its_server_or_its_robot_and_stays(make_robot: MakeRobot) -> None:
+def test_a_device_is_unavailable_without_its_server_or_its_robot(make_robot: MakeRobot) -> None:
     robot = make_robot("anna", "--homeassistant", "--allow", "say,status")
     with HomeAssistant(robot.broker) as home:
         device = home.device()
@@ -86,32 +88,30 @@ def test_a_device_is_unavailable_without_its_server_or_its_robot_and_stays(make_
         later.await_states(later.device(), state="unavailable")
 
 
-def test_a_robot_without_the_option_tells_home_assistant_nothing(robot: Robot) -> None:
+def test_a_robot_without_the_option_is_not_announced(robot: Robot) -> None:
     assert robot.desk("say", "--wait", "hello").code == 0
-    assert "homeassistant" not in robot.broker.log  # neither published nor subscribed to
+    assert "homeassistant" not in robot.broker.log  # the bridge neither published nor subscribed
     with HomeAssistant(robot.broker) as home:
         assert home.publish(*BIRTH) == NO_SUBSCRIBERS
 
 
-def test_robots_and_home_assistant_work_by_the_printed_access_list(
-    make_talk: MakeTalk, make_bridge: MakeBridge
-) -> None:
-    users = {each: f"password of {each}" for each in ("anna", "r2.d2", "homeassistant", "olga")}
+def test_the_printed_access_rules_suffice_for_home_assistant(make_talk: MakeTalk, make_bridge: MakeBridge) -> None:
+    users = {user: f"password of {user}" for user in ("anna", "r2.d2", "homeassistant", "olga")}
     rules = topics.access_rules(("olga",), homeassistant=True, name="r2.d2")
     with Broker(users=users, acl=f"{rules}\n") as broker:
         for name in ("anna", "r2.d2"):
             make_bridge(make_talk(scripted=True), broker, name, "--homeassistant", user=name, observer="olga")
         with HomeAssistant(broker, user="homeassistant") as home:
-            announced = home.await_message(lambda each: each.topic == DOTTED)
-            home.await_message(lambda each: each.topic == ANNA)
+            announced = home.await_message(lambda message: message.topic == DOTTED)
+            home.await_message(lambda message: message.topic == ANNA)
             home.publish(*BIRTH)
             device = home.device()
             home.command(device, "say", "hello")
             home.await_states(device, last="SUCCEEDED")
-            home.await_message(lambda each: each.topic == DOTTED and each is not announced)
+            home.await_message(lambda message: message.topic == DOTTED and message is not announced)
 
 
-def test_a_robot_that_may_not_announce_itself_says_so(
+def test_a_bridge_that_may_not_announce_its_robot_logs_the_next_step(
     make_talk: MakeTalk, secure_broker: Broker, make_bridge: MakeBridge
 ) -> None:
     talk = make_talk(scripted=True)

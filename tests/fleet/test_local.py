@@ -1,4 +1,4 @@
-"""The bridge's connection to its server. No data may get lost, and no resources may leak."""
+"""The bridge's connection to its server."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ pytestmark = pytest.mark.timeout(20)
 
 @pytest.fixture
 def listening() -> Iterator[socket.socket]:
-    """A server's socket; the test greets."""
+    """The socket of a server. The test sends the greeting."""
     with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
         listening.bind(f"{directory}/s")
         listening.listen()
@@ -51,7 +51,7 @@ async def accepted(listening: socket.socket) -> socket.socket:
 
 @contextlib.asynccontextmanager
 async def greeted(listening: socket.socket) -> AsyncIterator[tuple[LocalConnection, socket.socket]]:
-    """A connection, and the server's end of it."""
+    """Connect to the socket, and yield both ends of the connection."""
     dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
     with await accepted(listening) as server:
         server.sendall(GREETING)
@@ -59,21 +59,21 @@ async def greeted(listening: socket.socket) -> AsyncIterator[tuple[LocalConnecti
 
 
 def lines(connected: socket.socket, count: int) -> list[bytes]:
-    with connected.makefile("rb") as said:
-        return [said.readline() for _ in range(count)]
+    with connected.makefile("rb") as file:
+        return [file.readline() for _ in range(count)]
 
 
 @pytest.mark.parametrize("parts", [(GREETING,), (GREETING[:9], GREETING[9:]), (GREETING + b'{"event": 1}\n',)])
 @pytest.mark.parametrize("wait", [0.0, 0.5])
 @in_loop
-async def test_a_server_may_greet_at_once_or_later_or_in_pieces(
+async def test_a_greeting_may_arrive_late_or_in_pieces(
     listening: socket.socket, parts: tuple[bytes, ...], wait: float
 ) -> None:
     dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
     with await accepted(listening) as server:
-        for each in parts:
+        for part in parts:
             await asyncio.sleep(wait)
-            server.sendall(each)
+            server.sendall(part)
         local = await dialing
         assert (local.boot, local.pid) == ("a1b2", 7)
         assert local.send(Exchange(Status()))
@@ -82,33 +82,33 @@ async def test_a_server_may_greet_at_once_or_later_or_in_pieces(
             encode({"request": "hello", "name": "bob"}),
             encode({"seq": 1, "request": "status"}),
         ]
-        heard = [each for _ in range(len(parts[-1].splitlines())) for each in await local.read()]
-        assert heard == [*parts[-1].splitlines()[1:], b"answered"]
+        received = [line for _ in range(len(parts[-1].splitlines())) for line in await local.read()]
+        assert received == [*parts[-1].splitlines()[1:], b"answered"]
         local.close()
         assert server.recv(1) == b""
 
 
 @in_loop
-async def test_lines_that_the_server_does_not_take_at_once_come_later_and_in_order(listening: socket.socket) -> None:
-    texts = [f"{each} " + "x" * 60_000 for each in range(50)]
+async def test_lines_that_do_not_fit_into_the_socket_are_sent_later_in_order(listening: socket.socket) -> None:
+    texts = [f"{number} " + "x" * 60_000 for number in range(50)]
     async with greeted(listening) as (local, server):
-        for each in texts:
-            assert local.send(Exchange(Say(each)))
+        for text in texts:
+            assert local.send(Exchange(Say(text)))
         assert not local.send(Exchange(Say("x" * 70_000)))
         sent = (await asyncio.to_thread(lines, server, 51))[1:]
-        assert [decode(each)["text"] for each in sent] == texts
+        assert [decode(line)["text"] for line in sent] == texts
         assert local.send(Exchange(Status()))
         assert decode((await asyncio.to_thread(lines, server, 1))[0])["request"] == "status"
         local.close()
 
 
-@pytest.mark.parametrize("who", ["the server", "the bridge"])
+@pytest.mark.parametrize("closed_by", ["server", "bridge"])
 @in_loop
-async def test_a_read_ends_with_the_connection(listening: socket.socket, who: str) -> None:
+async def test_a_read_returns_when_the_connection_ends(listening: socket.socket, closed_by: str) -> None:
     async with greeted(listening) as (local, server):
         reading = asyncio.create_task(local.read())
         await asyncio.sleep(0.05)
-        if who == "the server":
+        if closed_by == "server":
             server.close()
         else:
             local.abort()
@@ -120,31 +120,31 @@ async def test_a_read_ends_with_the_connection(listening: socket.socket, who: st
 
 
 @in_loop
-async def test_a_server_that_says_much_does_not_block_the_loop(listening: socket.socket) -> None:
+async def test_a_server_that_sends_much_does_not_block_the_loop(listening: socket.socket) -> None:
     async with greeted(listening) as (local, server):
         server.setblocking(False)
-        said = 0
+        sent = 0
         with contextlib.suppress(BlockingIOError):
             while True:
-                said += server.send(b'{"event": "alive"}\n' * 500)
-        turns = reads = heard = 0
+                sent += server.send(b'{"event": "alive"}\n' * 500)
+        turns = reads = received = 0
 
-        def look() -> None:
+        def count_turn() -> None:
             nonlocal turns
             turns += 1
-            asyncio.get_running_loop().call_soon(look)
+            asyncio.get_running_loop().call_soon(count_turn)
 
-        look()
-        while heard < said // 19:
-            heard += len(await local.read())
+        count_turn()
+        while received < sent // 19:
+            received += len(await local.read())
             reads += 1
         assert turns >= reads > 1
         local.close()
 
 
 @in_loop
-async def test_a_connection_on_which_a_line_can_not_be_sent_has_ended(listening: socket.socket) -> None:
-    """After a partly sent line, the next line would be read as part of the same request."""
+async def test_a_connection_ends_if_a_line_cannot_be_sent(listening: socket.socket) -> None:
+    """After a partly sent line, the server would read the next line as part of the same request."""
     async with greeted(listening) as (local, server):
         lines(server, 1)
         reading = asyncio.create_task(local.read())
@@ -156,24 +156,24 @@ async def test_a_connection_on_which_a_line_can_not_be_sent_has_ended(listening:
         local.close()
 
 
-@pytest.mark.parametrize("said", [encode(busy_greeting()), b"220 mail\n", b""])
+@pytest.mark.parametrize("answer", [encode(busy_greeting()), b"220 mail\n", b""])
 @in_loop
 async def test_a_refused_connection_raises_busy_or_unavailable(
-    listening: socket.socket, said: bytes, monkeypatch: pytest.MonkeyPatch
+    listening: socket.socket, answer: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("talkcli.client.connect.ANSWER_LIMIT_S", 0.3)
     dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
     with contextlib.suppress(TimeoutError):
-        while not dialing.done():  # a busy server is tried again
+        while not dialing.done():  # `dial` retries while the server is busy
             listening.settimeout(0.5)
             with await accepted(listening) as server:
-                server.sendall(said)
-    with pytest.raises(Busy if said.startswith(b"{") else ServerUnavailable):
+                server.sendall(answer)
+    with pytest.raises(Busy if answer.startswith(b"{") else ServerUnavailable):
         await dialing
 
 
 @in_loop
-async def test_a_server_that_refuses_this_user_is_passed_over_for_the_next_place(
+async def test_the_next_socket_is_tried_if_a_server_refuses_this_user(
     listening: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("TALK_SOCKET", raising=False)
@@ -181,8 +181,8 @@ async def test_a_server_that_refuses_this_user_is_passed_over_for_the_next_place
         first.bind(f"{directory}/s")
         first.listen()
         first.settimeout(PATIENCE)
-        places = [first.getsockname(), listening.getsockname()]
-        monkeypatch.setattr("talkcli.paths.client_sockets", lambda _: places)
+        sockets = [first.getsockname(), listening.getsockname()]
+        monkeypatch.setattr("talkcli.paths.client_sockets", lambda _: sockets)
         dialing = asyncio.create_task(dial(None, "bob"))
         with await accepted(first) as refusing:
             refusing.sendall(encode({"talk": 1, "error": "forbidden", "message": "not you"}))
@@ -205,8 +205,8 @@ async def test_a_server_that_does_not_greet_in_time_is_unavailable(
             await dialing
 
 
-@pytest.mark.parametrize("given_up", [False, True])
-def test_a_link_that_nobody_waits_for_any_more_is_closed_once_it_is_open(given_up: bool) -> None:
+@pytest.mark.parametrize("canceled", [False, True])
+def test_a_link_is_closed_if_it_opens_after_a_cancel(canceled: bool) -> None:
     needs_packages("paho")
     from talkcli.fleet.link import LinkOpener
 
@@ -221,8 +221,8 @@ def test_a_link_that_nobody_waits_for_any_more_is_closed_once_it_is_open(given_u
 
     link = SlowLink()
     opener = LinkOpener(cast("Link", link), link.done.set)
-    if given_up:
+    if canceled:
         opener.cancel()
     link.go.set()
-    assert (link.closed if given_up else link.done).wait(PATIENCE)
+    assert (link.closed if canceled else link.done).wait(PATIENCE)
     assert link.closed.is_set() != link.done.is_set()

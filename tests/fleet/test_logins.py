@@ -1,4 +1,4 @@
-"""Logins at a broker, the trust in it, secrets, and the access control list that talk prints."""
+"""Logins, certificates, secrets and access rules at a broker."""
 
 from __future__ import annotations
 
@@ -22,45 +22,45 @@ if TYPE_CHECKING:
     from tests.fleet.conftest import MakeBridge
 
 SECRET = "correct horse battery staple"
-#: The exit code of a desk that was let in, and finds no robot there.
-LET_IN = 3
+#: The exit code of a desk that can log in, but finds no robot.
+LOGGED_IN = 3
 
 
-def assert_refused(broker: Broker, code: int, words: str, **login: Any) -> None:
-    """Assert that a desk with this login ends with this code and says this."""
-    with Desk(broker, **login) as somebody:
-        done = somebody.run("--robot", "nobody", "status")
-    assert (done.code, done.out, words in done.err) == (code, "", True), done
+def assert_refused(broker: Broker, code: int, expected: str, **login: Any) -> None:
+    """Assert the exit code and the error message of a desk with this login."""
+    with Desk(broker, **login) as operator:
+        done = operator.run("--robot", "nobody", "status")
+    assert (done.code, done.out, expected in done.err) == (code, "", True), done
     assert SECRET not in done.err
 
 
-def assert_let_in(broker: Broker, **login: Any) -> None:
-    assert_refused(broker, LET_IN, "no robot 'nobody'", **login)
+def assert_logged_in(broker: Broker, **login: Any) -> None:
+    assert_refused(broker, LOGGED_IN, "no robot 'nobody'", **login)
 
 
-def test_only_the_right_password_lets_in() -> None:
+def test_a_login_needs_the_right_password() -> None:
     hint = "set TALK_MQTT_USER and TALK_MQTT_PASSWORD_FILE for your login"
     with Broker(secure=True, users={"olga": SECRET}) as broker:
-        assert_let_in(broker, user="olga")
+        assert_logged_in(broker, user="olga")
         assert_refused(broker, 10, "rejected the login of 'olga'", user="olga", password="wrong")
         assert_refused(broker, 10, hint, user="olga", password=False)
         assert_refused(broker, 10, "rejected the login of an anonymous user")
 
 
-def test_only_a_valid_certificate_of_the_ca_is_trusted() -> None:
+def test_a_broker_needs_a_valid_certificate_of_the_ca() -> None:
     untrusted = "the broker's certificate is not trusted"
     with Broker(secure=True) as broker:
-        assert_let_in(broker)
+        assert_logged_in(broker)
         for env in ({"TALK_MQTT_CA": stranger().file}, {"TALK_MQTT_CA": ""}):
             assert_refused(broker, 10, untrusted, env=env)
             assert_refused(broker, 10, "set TALK_MQTT_CA", env=env)
-        # The certificate is for localhost and 127.0.0.1 alone.
+        # The certificate is only for localhost and 127.0.0.1.
         assert_refused(broker, 10, untrusted, env={"TALK_BROKER": f"mqtts://0.0.0.0:{broker.port}"})
     with Broker(expired=True) as broker:
         assert_refused(broker, 10, "expired")
 
 
-def test_a_certificate_is_a_login_for_a_robot_and_for_a_desk(make_talk: MakeTalk, make_bridge: MakeBridge) -> None:
+def test_robots_and_desks_can_log_in_with_a_certificate(make_talk: MakeTalk, make_bridge: MakeBridge) -> None:
     rules = topics.access_rules(OPERATORS) + "\n\nuser watcher\ntopic read #\n"
     other, own = stranger().client("olga"), authority().client("olga")
     hint = "set TALK_MQTT_CERT and TALK_MQTT_KEY to a certificate that it accepts"
@@ -72,27 +72,27 @@ def test_a_certificate_is_a_login_for_a_robot_and_for_a_desk(make_talk: MakeTalk
         talk = make_talk(scripted=True)
         bridge = make_bridge(talk, broker, "anna", cert="anna", online=False)
         with Listener(broker, "talk/robot/anna/presence", cert="watcher") as listener:
-            listener.await_message(lambda each: bool(each.payload and each.json["server"]), within=10)
-        with Desk(broker, cert="olga", env={"TALK_MQTT_USER": "olga"}) as somebody:
-            done = somebody.run("--robot", "anna", "say", "--wait", "--feedback", "hello")
+            listener.await_message(lambda message: bool(message.payload and message.json["server"]), within=10)
+        with Desk(broker, cert="olga", env={"TALK_MQTT_USER": "olga"}) as operator:
+            done = operator.run("--robot", "anna", "say", "--wait", "--feedback", "hello")
             assert done.code == 0, done
-        with Desk(broker, cert="otto", env={"TALK_MQTT_USER": "olga"}) as somebody:  # which only claims to be olga
-            done = somebody.run("--robot", "anna", "say", "hello")
+        with Desk(broker, cert="otto", env={"TALK_MQTT_USER": "olga"}) as operator:  # otto claims to be olga
+            done = operator.run("--robot", "anna", "say", "hello")
             assert done.code == 10, done
         assert talk.watcher.texts("ACTIVE") == ["hello"]
         assert bridge.terminate() == 0
 
 
-def test_a_password_is_sent_in_clear_text_to_another_machine_only_with_insecure() -> None:
-    """0.0.0.0 is this machine, but no rule says so."""
+def test_a_password_is_sent_without_tls_only_with_insecure() -> None:
+    """0.0.0.0 is this machine, but isn't treated as local."""
     with Broker(users={"olga": SECRET}) as broker:
         elsewhere = {"TALK_BROKER": f"mqtt://0.0.0.0:{broker.port}"}
-        assert_let_in(broker, user="olga")  # at 127.0.0.1 nobody listens in between
+        assert_logged_in(broker, user="olga")  # no one can eavesdrop on 127.0.0.1
         before = broker.log.count("New connection")
         assert_refused(broker, 2, "in clear text", user="olga", env=elsewhere)
         assert broker.log.count("New connection") == before
-        with Desk(broker, user="olga", env=elsewhere) as somebody:
-            assert somebody.run("--robot", "nobody", "--insecure", "status").code == LET_IN
+        with Desk(broker, user="olga", env=elsewhere) as operator:
+            assert operator.run("--robot", "nobody", "--insecure", "status").code == LOGGED_IN
 
 
 def test_a_password_is_shown_nowhere(make_talk: MakeTalk, make_bridge: MakeBridge) -> None:
@@ -100,12 +100,12 @@ def test_a_password_is_shown_nowhere(make_talk: MakeTalk, make_bridge: MakeBridg
         talk = make_talk(scripted=True)
         bridge = make_bridge(talk, broker, "anna", user="anna", observer="watcher")
         with Listener(broker, "#", user="watcher", password="other") as listener:
-            with Desk(broker, user="anna") as somebody:
-                done = somebody.run("--robot", "anna", "--json", "say", "--wait", "hello")
+            with Desk(broker, user="anna") as operator:
+                done = operator.run("--robot", "anna", "--json", "say", "--wait", "hello")
                 assert done.code == 0, done
-            listener.await_message(lambda each: each.topic.endswith("/state") and b"SUCCEEDED" in each.payload)
-            listener.await_message(lambda each: each.topic.endswith("/status"))
-            published = b"".join(each.topic.encode() + each.payload for each in listener.messages)
+            listener.await_message(lambda message: message.topic.endswith("/state") and b"SUCCEEDED" in message.payload)
+            listener.await_message(lambda message: message.topic.endswith("/status"))
+            published = b"".join(message.topic.encode() + message.payload for message in listener.messages)
         assert SECRET not in command_line(bridge.pid)
         with open(f"/proc/{bridge.pid}/environ", "rb") as environ:
             assert SECRET.encode() not in environ.read()
@@ -114,16 +114,16 @@ def test_a_password_is_shown_nowhere(make_talk: MakeTalk, make_bridge: MakeBridg
             assert SECRET not in shown
 
 
-def test_a_robot_reads_its_password_again_and_keeps_the_last_one_it_could_read(
+def test_the_password_file_is_read_again_and_the_last_password_is_kept(
     make_talk: MakeTalk, make_bridge: MakeBridge
 ) -> None:
-    """The broker may be mended, or the password file, and nobody may be there to start the bridge again."""
+    """The login or the password file may be repaired later, and the bridge must not need a restart."""
     with Broker(users={"anna": SECRET, "watcher": "other"}) as broker:
         talk = make_talk(scripted=True)
         bridge = make_bridge(talk, broker, "anna", user="anna", password="wrong", observer="watcher", online=False)
         bridge.await_log("rejected the login of 'anna'")
         assert bridge.running
-        file = broker.env("anna")["TALK_MQTT_PASSWORD_FILE"]  # which has the right one now
+        file = broker.env("anna")["TALK_MQTT_PASSWORD_FILE"]  # the file has the right password now
         bridge.await_online(15)
         os.remove(file)
         broker.kill()
@@ -133,10 +133,10 @@ def test_a_robot_reads_its_password_again_and_keeps_the_last_one_it_could_read(
         assert SECRET not in bridge.log
 
 
-# The access control list; `tests/unit/test_fleet_topics.py` has its rules
+# The access rules. `tests/unit/test_fleet_topics.py` tests each rule.
 
 
-def test_a_fleet_works_by_the_rules_and_a_login_without_rights_is_told_what_is_missing(
+def test_the_printed_access_rules_allow_only_what_a_login_needs(
     make_talk: MakeTalk, secure_broker: Broker, make_bridge: MakeBridge
 ) -> None:
     robots = []
@@ -145,8 +145,8 @@ def test_a_fleet_works_by_the_rules_and_a_login_without_rights_is_told_what_is_m
         bridge = make_bridge(talk, secure_broker, name, user=name, observer="olga", groups=["warehouse"])
         robots.append(Robot(talk, secure_broker, bridge))
     anna, bert = robots
-    for words in (["say", "--wait", "--feedback", "hello"], ["status"], ["log"], ["cancel"]):
-        assert desk(secure_broker, "anna", *words, user="olga").code == 0
+    for arguments in (["say", "--wait", "--feedback", "hello"], ["status"], ["log"], ["cancel"]):
+        assert desk(secure_broker, "anna", *arguments, user="olga").code == 0
     for user in (*OTHERS, "bert"):  # a login without rules, and another robot's
         done = desk(secure_broker, "anna", "say", "hello", user=user)
         assert (done.code, done.out) == (10, ""), done
@@ -158,15 +158,15 @@ def test_a_fleet_works_by_the_rules_and_a_login_without_rights_is_told_what_is_m
         assert olga.ask("hello", to="talk/robot/bert")["ok"]
     bert.talk.watcher.wait_for(None, "SUCCEEDED")
     assert (anna.spoken, bert.spoken) == (["hello"], ["plain"])
-    for each in robots:
-        assert "right" not in each.bridge.log, each.bridge.log
+    for robot in robots:
+        assert "right" not in robot.bridge.log, robot.bridge.log
 
 
 @pytest.mark.slow
-def test_a_bridge_that_logs_in_as_another_robot_says_that_it_has_no_rights(
+def test_a_bridge_with_the_login_of_another_robot_reports_missing_rights(
     make_talk: MakeTalk, secure_broker: Broker, make_bridge: MakeBridge
 ) -> None:
-    """The bridge notices because nothing that it sends to itself comes back."""
+    """The bridge notices because the messages that it sends to itself don't return."""
     talk = make_talk(scripted=True)
     with Listener(secure_broker, "talk/robot/+/presence", user="olga") as olga:
         bridge = make_bridge(talk, secure_broker, "anna", user="bert", online=False)

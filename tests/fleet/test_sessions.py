@@ -1,4 +1,4 @@
-"""Sessions of remote clients: how they end, and their limits. The tests use a real server and no broker."""
+"""Sessions of remote clients: how they end, and their limits. The server is real, and there is no broker."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ GONE = 90.0
 
 @pytest.fixture
 def talk(make_talk: MakeTalk) -> Talk:
-    """A silent server that is paused."""
+    """A paused server without sound."""
     talk = make_talk("--player", "null")
     talk.request("pause")
     return talk
@@ -40,7 +40,7 @@ def talk(make_talk: MakeTalk) -> Talk:
 
 @pytest.fixture
 def pass_time(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
-    """Advances the clock of the running event loop."""
+    """A function that advances the clock of the running event loop."""
     passed = 0.0
 
     def move(seconds: float) -> None:
@@ -63,28 +63,28 @@ async def await_clients(talk: Talk, most: int) -> None:
         await asyncio.sleep(0.01)
 
 
-@pytest.mark.parametrize("waits", ["for room", "for a result", "for events"])
+@pytest.mark.parametrize("waits_for", ["room", "a result", "events"])
 @in_loop
-async def test_a_remote_client_that_is_silent_for_90_s_is_gone_whatever_it_waits_for(
-    talk: Talk, pass_time: Callable[[float], None], waits: str
+async def test_a_waiting_remote_client_is_gone_after_90_s_of_silence(
+    talk: Talk, pass_time: Callable[[float], None], waits_for: str
 ) -> None:
     anna = SessionsWithoutBroker(talk.socket)
-    if waits == "for room":
-        for each in range(20):
-            await anna.ask(say(each), "s2")
+    if waits_for == "room":
+        for number in range(20):
+            await anna.ask(say(number), "s2")
         anna.post(say(100, patient=True, wait=True, id="patient"))
         await anna.ask({"seq": 101, "request": "hello"})
         assert [request.seq for request, _, _ in anna.sessions.waiting] == [100]
-    elif waits == "for a result":
+    elif waits_for == "a result":
         await anna.ask(say(100, wait=True))
     else:
         await anna.ask({"seq": 100, "request": "watch"})
     for _ in range(8):  # lines sent to the client don't prove that it is alive
         pass_time(11)
         anna.sessions.tick()
-        if waits == "for events":
+        if waits_for == "events":
             await anna.ask(say(1), "s3")
-    assert not [each for each in anna.lines() if each.get("event") == "gone"]
+    assert not [line for line in anna.lines() if line.get("event") == "gone"]
     pass_time(GONE - 88 + 0.1)
     anna.sessions.tick()
     assert "must send hello every 30 s" in anna.lines()[-1]["message"]
@@ -96,44 +96,40 @@ async def test_a_remote_client_that_is_silent_for_90_s_is_gone_whatever_it_waits
 
 
 @in_loop
-async def test_a_remote_client_that_says_hello_keeps_what_it_waits_for(
-    talk: Talk, pass_time: Callable[[float], None]
-) -> None:
+async def test_hello_keeps_the_session_of_a_remote_client(talk: Talk, pass_time: Callable[[float], None]) -> None:
     anna = SessionsWithoutBroker(talk.socket)
     goal = await anna.ask(say(1, wait=True))
-    for each in range(2, 8):
+    for number in range(2, 8):
         pass_time(30)
         anna.sessions.tick()
-        await anna.ask({"seq": each, "request": "hello"})
+        await anna.ask({"seq": number, "request": "hello"})
     await anna.ask({"seq": 10, "request": "cancel"})
-    ended = await anna.line(lambda each: each.get("event") == "result")
+    ended = await anna.line(lambda line: line.get("event") == "result")
     assert ended["goal"]["id"] == goal["goal"]["id"]
     anna.sessions.end_all()
 
 
 @in_loop
-async def test_a_remote_client_to_whom_nothing_is_owed_is_let_go_without_a_word(
-    talk: Talk, pass_time: Callable[[float], None]
-) -> None:
+async def test_an_idle_remote_client_loses_its_session_silently(talk: Talk, pass_time: Callable[[float], None]) -> None:
     anna = SessionsWithoutBroker(talk.socket)
     before = talk.request("status")["server"]["clients"]
     await anna.ask({"seq": 1, "request": "status"})
-    told = anna.lines()
+    lines = anna.lines()
     pass_time(GONE + 0.1)
     anna.sessions.tick()
     await await_clients(talk, before)
-    assert anna.lines() == told
+    assert anna.lines() == lines
 
 
 @in_loop
-async def test_requests_before_a_goodbye_are_carried_out_except_goals_that_wait_for_room(talk: Talk) -> None:
+async def test_only_goals_that_wait_for_room_are_dropped_by_a_goodbye(talk: Talk) -> None:
     """With and without a connection to the server. A client that returns after a goodbye gets answers again."""
     anna = SessionsWithoutBroker(talk.socket)
     before = talk.request("status")["server"]["clients"]
     await anna.ask({"seq": 1, "request": "hello"}, "s2")
     for session in ("s1", "s2", "s3"):
         anna.post(say(2, id=f"of-{session}"), session)
-        if session != "s2":  # which the server would take at once
+        if session != "s2":  # this session is connected, so the server would accept the goal at once
             anna.post(say(3, id=f"of-{session}-patient", patient=True), session)
         anna.post(b"", session)
     assert (await anna.ask({"seq": 4, "request": "hello"}, "s3"))["ok"]
@@ -142,34 +138,32 @@ async def test_requests_before_a_goodbye_are_carried_out_except_goals_that_wait_
     await await_clients(talk, before)
     with talk.connect() as wire:
         wire.request("status")
-        assert sorted(each["pending"]["id"] for each in wire.items) == ["last", "of-s1", "of-s2", "of-s3"]
+        assert sorted(item["pending"]["id"] for item in wire.items) == ["last", "of-s1", "of-s2", "of-s3"]
     assert anna.lines("s1") == []
 
 
 @in_loop
-async def test_a_cancel_takes_the_place_of_the_remote_client_that_is_silent_for_longest(
-    talk: Talk, pass_time: Callable[[float], None]
-) -> None:
+async def test_a_cancel_ends_the_longest_silent_session(talk: Talk, pass_time: Callable[[float], None]) -> None:
     anna = SessionsWithoutBroker(talk.socket)
-    for each in range(32):
-        await anna.ask({"seq": 1, "request": "watch"}, f"w{each}")
+    for number in range(32):
+        await anna.ask({"seq": 1, "request": "watch"}, f"w{number}")
         pass_time(0.1)
     await anna.ask({"seq": 2, "request": "hello"}, "w0")
     assert (await anna.ask({"seq": 3, "request": "log"}, "another"))["error"]["code"] == "busy"
     assert (await anna.ask({"seq": 3, "request": "cancel"}, "urgent"))["ok"]
     await anna.ask(say(4), "w0")
-    for each in range(32):
-        gone = [line for line in anna.lines(f"w{each}") if line.get("event") == "gone"]
-        assert bool(gone) == (each == 1), each
+    for number in range(32):
+        gone = [line for line in anna.lines(f"w{number}") if line.get("event") == "gone"]
+        assert bool(gone) == (number == 1), number
     assert (await anna.ask({"seq": 4, "request": "status"}, "urgent"))["ok"]  # in its existing session
-    assert (await anna.ask({"seq": 5, "request": "log"}, "another"))["ok"]  # it isn't waiting for anything now
+    assert (await anna.ask({"seq": 5, "request": "log"}, "another"))["ok"]  # that session waits for nothing now
     await anna.ask({"seq": 5, "request": "cancel"}, "w0")
     anna.sessions.end_all()
 
 
 @in_loop
-async def test_remote_clients_that_come_and_go_at_a_server_that_hangs_take_32_connections_and_no_threads() -> None:
-    """A closed connection stays in the backlog. A client that leaves before its turn is not connected."""
+async def test_clients_of_a_hung_server_take_32_connections_and_no_threads() -> None:
+    """A closed connection stays in the backlog. A client that leaves before its turn is never connected."""
     with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
         listening.bind(f"{directory}/s")
         listening.listen(256)
@@ -177,17 +171,17 @@ async def test_remote_clients_that_come_and_go_at_a_server_that_hangs_take_32_co
         anna = SessionsWithoutBroker(f"{directory}/s")
         before = threading.active_count()
         for _ in range(100):
-            for each in range(3):
-                anna.post({"seq": 1, "request": "status"}, f"s{each}")
-                await asyncio.sleep(0)  # so that it begins
-                anna.post(b"", f"s{each}")
+            for number in range(3):
+                anna.post({"seq": 1, "request": "status"}, f"s{number}")
+                await asyncio.sleep(0)  # so that the session starts to connect
+                anna.post(b"", f"s{number}")
         await asyncio.sleep(0)
         assert threading.active_count() == before
         for _ in range(32):
             listening.accept()[0].close()
         anna.post({"seq": 2, "request": "status"})
         (await asyncio.to_thread(listening.accept))[0].close()
-        answer = await anna.line(lambda each: each.get("seq") == 2)
+        answer = await anna.line(lambda line: line.get("seq") == 2)
         assert answer["error"]["code"] == "no_server"
         listening.setblocking(False)
         with pytest.raises(BlockingIOError):
@@ -195,7 +189,7 @@ async def test_remote_clients_that_come_and_go_at_a_server_that_hangs_take_32_co
 
 
 @in_loop
-async def test_a_session_that_ends_keeps_its_slot_until_the_server_has_greeted() -> None:
+async def test_an_ended_session_keeps_its_slot_until_the_server_greets() -> None:
     with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
         listening.bind(f"{directory}/s")
         listening.listen()
@@ -203,22 +197,22 @@ async def test_a_session_that_ends_keeps_its_slot_until_the_server_has_greeted()
         anna = SessionsWithoutBroker(f"{directory}/s")
         slots = anna.sessions.dialing = asyncio.Semaphore(1)
         anna.post({"seq": 1, "request": "log"})
-        with (await asyncio.to_thread(listening.accept))[0] as server, server.makefile("rb") as said:
+        with (await asyncio.to_thread(listening.accept))[0] as server, server.makefile("rb") as file:
             anna.post(b"")
             await asyncio.sleep(0.1)
             assert slots.locked()
             server.sendall(encode(greeting(__version__, 7, "a1b2")))
             await asyncio.wait_for(slots.acquire(), 5)
-            assert await asyncio.to_thread(said.readlines) == [encode({"request": "hello", "name": "mqtt:bob"})]
+            assert await asyncio.to_thread(file.readlines) == [encode({"request": "hello", "name": "mqtt:bob"})]
     gc.collect()  # reports sockets that were left open
 
 
 @in_loop
-async def test_a_session_without_a_free_descriptor_gives_its_slot_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    def none_left(*_: object) -> None:
+async def test_a_session_without_a_free_descriptor_returns_its_slot(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
         raise OSError("Too many open files")
 
-    monkeypatch.setattr("talkcli.client.connect.reach", none_left)
+    monkeypatch.setattr("talkcli.client.connect.reach", fail)
     anna = SessionsWithoutBroker("unused")
     slots = anna.sessions.dialing = asyncio.Semaphore(1)
     anna.post({"seq": 1, "request": "status"})
@@ -227,10 +221,10 @@ async def test_a_session_without_a_free_descriptor_gives_its_slot_back(monkeypat
 
 
 @in_loop
-async def test_all_remote_clients_hold_four_mebibytes_and_a_cancel_is_taken_beyond(talk: Talk) -> None:
+async def test_requests_of_all_clients_are_limited_to_4_mib_except_cancels(talk: Talk) -> None:
     anna = SessionsWithoutBroker(talk.socket)
-    for each in range(20):
-        await anna.ask(say(each), "full")
+    for number in range(20):
+        await anna.ask(say(number), "full")
     long = {"text": "a", "patient": True, "data": {"more": "x" * 900}}
     blanks = b" " * 60_000
     line = json.dumps({"seq": 1, "request": "say", **long}).encode()
@@ -239,9 +233,9 @@ async def test_all_remote_clients_hold_four_mebibytes_and_a_cancel_is_taken_beyo
         for _ in range(40):
             anna.post(line + blanks, f"s{session}")
         await anna.ask({"seq": 2, "request": "hello"}, f"s{session}")
-        refused.append([each for each in anna.lines(f"s{session}") if each.get("ok") is False])
-    assert [bool(each) for each in refused] == [False, True, True]
-    assert {each["error"]["code"] for each in refused[1]} == {"busy"}
+        refused.append([line for line in anna.lines(f"s{session}") if line.get("ok") is False])
+    assert [bool(lines) for lines in refused] == [False, True, True]
+    assert {line["error"]["code"] for line in refused[1]} == {"busy"}
     assert (4 << 20) - 61_000 < anna.sessions.count_waiting_bytes() <= 4 << 20
     assert (await anna.ask({"seq": 3, "request": "cancel"}, "another"))["ok"]
     assert anna.sessions.count_waiting_bytes() == 0
@@ -250,19 +244,17 @@ async def test_all_remote_clients_hold_four_mebibytes_and_a_cancel_is_taken_beyo
 
 @pytest.mark.parametrize(("wait", "feedback"), [(False, False), (True, False), (False, True)])
 @in_loop
-async def test_a_goal_that_never_reached_the_server_is_told_as_the_server_would(
-    talk: Talk, wait: bool, feedback: bool
-) -> None:
+async def test_a_bridge_reports_its_own_results_like_the_server(talk: Talk, wait: bool, feedback: bool) -> None:
     anna = SessionsWithoutBroker(talk.socket)
-    for each in range(20):
-        await anna.ask(say(each), "full")
+    for number in range(20):
+        await anna.ask(say(number), "full")
     more = {"wait": wait, "feedback": feedback, "key": "k", "priority": -2}
     anna.post(say(1, id="patient", patient=True, **more))
     await anna.ask(say(2, id="mine", **more))
     await anna.ask({"seq": 3, "request": "cancel", "ids": ["patient"]}, "another")
-    await anna.line(lambda each: each.get("seq") == 1)
+    await anna.line(lambda line: line.get("seq") == 1)
     for number, state, reason in ((1, "RECALLED", "canceled"), (2, "REJECTED", "queue_full")):
-        (reply,) = [each for each in anna.lines() if each.get("seq") == number]
+        (reply,) = [line for line in anna.lines() if line.get("seq") == number]
         goal = reply["goal"]
         assert (reply["ok"], goal["state"], goal["reason"]) == (True, state, reason)
         assert (goal["text"], goal["key"], goal["priority"]) == (f"sentence {number}", "k", -2)
@@ -270,20 +262,20 @@ async def test_a_goal_that_never_reached_the_server_is_told_as_the_server_would(
         assert bool(goal["by"]) == (number == 1)
         assert (goal["id"] == "patient") == (number == 1)  # a rejected goal never has the id that its client chose
         assert goal["id"] != "mine"
-        told = [each for each in anna.lines() if "event" in each and goal["id"] in json.dumps(each)]
-        assert [each["event"] for each in told] == (["state", "result"] if wait or feedback else [])
-        assert all(each["goal"] == goal for each in told[1:])
+        events = [line for line in anna.lines() if "event" in line and goal["id"] in json.dumps(line)]
+        assert [event["event"] for event in events] == (["state", "result"] if wait or feedback else [])
+        assert all(event["goal"] == goal for event in events[1:])
     anna.sessions.end_all()
 
 
 @in_loop
-async def test_an_answer_that_is_too_long_for_the_broker_has_no_words_or_is_an_error(talk: Talk) -> None:
+async def test_a_reply_too_long_for_the_broker_has_no_text_or_is_an_error(talk: Talk) -> None:
     anna = SessionsWithoutBroker(talk.socket, room=3_000)
-    for each in range(20):
-        await anna.ask(say(each), "full")
+    for number in range(20):
+        await anna.ask(say(number), "full")
     goal = (await anna.ask(say(1, text="long " * 1_000, wait=True)))["goal"]
     assert (goal["state"], goal["reason"], goal["text"]) == ("REJECTED", "queue_full", None)
-    ended = await anna.line(lambda each: each.get("event") == "result")
+    ended = await anna.line(lambda line: line.get("event") == "result")
     assert ended["goal"] == goal
     await anna.ask({"seq": 2, "request": "cancel"})
     anna.sessions.end_all()

@@ -1,4 +1,4 @@
-"""Commands to several robots of which some fail: the reason of each, and the exit code for all of them."""
+"""Commands that fail on some of several robots: the reasons, and the exit code."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.fleet.bridge.policy import ALLOWABLE_REQUESTS
-from tests.fleet import told as robots_told
-from tests.fleet.many import RealRobots, alike, assert_told, at_once, objects, request, told
+from tests.fleet import publish
+from tests.fleet.many import RealRobots, alike, assert_outcomes, at_once, objects, printed_outcomes, request
 from tests.fleet.robot import LONG
 from tests.support.bridge import Desk
 from tests.support.broker import Broker
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 BOTH, OFFLINE = ["wh-1", "wh-2"], [f"off-{number}" for number in range(1, 8)]
-#: A glob and a group that pick both and no others.
-PICKS = ("wh-[12]", "@willing")
-#: Characters of a text that no server takes, and of one that no request can hold.
+#: A glob and a group that select only these two robots.
+SELECTIONS = ("wh-[12]", "@willing")
+#: Characters of a text that is too long for a server, and of a text that is too long for a request.
 TOO_LONG, FAR_TOO_LONG = 20_000, 70_000
 
 
@@ -35,7 +35,7 @@ def broker() -> Iterator[Broker]:
 
 @pytest.fixture(scope="module")
 def robots(broker: Broker) -> Iterator[RealRobots]:
-    """Two that allow all requests; besides them wh-3, which allows little, wh-4 without a server, seven offline."""
+    """Two robots that allow all requests, wh-3 that allows only `status`, wh-4 without a server, and seven offline."""
     all_allowed = ("--allow", ",".join(ALLOWABLE_REQUESTS))
     with (
         Listener(broker, "talk/robot/wh-4/presence") as publisher,
@@ -43,29 +43,29 @@ def robots(broker: Broker) -> Iterator[RealRobots]:
         RealRobots(broker, ["wh-3"], ["day"], ("--allow", "status")),
         RealRobots(broker, ["wh-4"], ["lonely"]) as lonely,
     ):
-        for each in OFFLINE:
-            robots_told.presence(publisher, each, online=False, groups=["night"])
+        for name in OFFLINE:
+            publish.presence(publisher, name, online=False, groups=["night"])
         lonely["wh-4"].talk.stop()
-        publisher.await_message(lambda each: each.json["online"] and each.json["server"] is None)
+        publisher.await_message(lambda message: message.json["online"] and message.json["server"] is None)
         yield result
 
 
 @pytest.fixture
 def desk(broker: Broker, robots: RealRobots) -> Iterator[Desk]:
-    """A desk; all goals are cancelled in the end."""
+    """A desk. All goals are cancelled afterwards."""
     with Desk(broker) as result:
         yield result
     request(robots, "cancel")
 
 
 def idle_or_failed(*names: str) -> dict[str, tuple[str, str, int]]:
-    """Return the outcomes of a cancel that finds nothing to cancel."""
+    """Return the outcomes of a cancel if there are no goals."""
     kinds = {"wh-3": ("-", "REFUSED", 10), "wh-4": ("-", "NO_SERVER", 3)}
     kinds |= dict.fromkeys(OFFLINE, ("-", "OFFLINE", 3))
-    return {each: kinds.get(each, ("-", "IDLE", 0)) for each in names}
+    return {name: kinds.get(name, ("-", "IDLE", 0)) for name in names}
 
 
-#: A pick, its robots, the exit code for all of them, and how many do as they are asked.
+#: A selection, its robots, the exit code, and the number of robots that succeed.
 MIXED: list[tuple[str, list[str], int, int]] = [
     ("@night", [*BOTH, *OFFLINE], 3, 2),
     ("wh-[124]", [*BOTH, "wh-4"], 3, 2),
@@ -75,20 +75,20 @@ MIXED: list[tuple[str, list[str], int, int]] = [
 ]
 
 
-def test_equal_failures_are_the_exit_code_and_different_ones_make_it_13(desk: Desk) -> None:
+def test_different_failures_exit_with_13_and_equal_ones_with_their_code(desk: Desk) -> None:
     *plain, for_programs, quiet = at_once(
         desk,
         *(["--robot", to, "cancel"] for to, _, _, _ in MIXED),
         *(["--robot", "@all", form, "cancel"] for form in ("--json", "-q")),
     )
     for done, (_, names, code, count) in zip(plain, MIXED, strict=True):
-        assert_told(done, code, idle_or_failed(*names), f"{count} of {len(names)} robots succeeded")
-    found = {name: ("-", each["state"], each["exit_code"]) for name, each in objects(for_programs).items()}
-    assert (for_programs.code, found) == (13, idle_or_failed(*MIXED[-1][1]))
+        assert_outcomes(done, code, idle_or_failed(*names), f"{count} of {len(names)} robots succeeded")
+    outcomes = {name: ("-", outcome["state"], outcome["exit_code"]) for name, outcome in objects(for_programs).items()}
+    assert (for_programs.code, outcomes) == (13, idle_or_failed(*MIXED[-1][1]))
     assert (quiet.code, quiet.out, quiet.err) == (13, "", "")
 
 
-#: A pick, one of its robots, and the reason why that does nothing.
+#: A selection, one of its robots, the error code, and the error message.
 WHY = [
     ("off-1*", "off-1", "no_server", "off-1 is offline, so nothing was sent"),
     ("@lonely", "wh-4", "no_server", "wh-4: no server found; tried: "),
@@ -97,90 +97,90 @@ WHY = [
         "wh-[3]",
         "wh-3",
         "permission_denied",
-        "wh-3: remote clients may not use pause on this robot; add it to --allow of its bridge",
+        "wh-3: this robot's bridge does not allow pause requests; add pause to its --allow",
     ),
     (
         "@day",
         "wh-3",
         "permission_denied",
-        "wh-3: remote clients may not use pause on this robot; add it to --allow of its bridge",
+        "wh-3: this robot's bridge does not allow pause requests; add pause to its --allow",
     ),
 ]
 
 
-def test_the_reason_is_told_in_words_and_as_a_code(robots: RealRobots, desk: Desk) -> None:
-    found = at_once(desk, *(["--robot", to, *form, "pause"] for form in ([], ["--json"]) for to, *_ in WHY))
+def test_each_failure_has_a_readable_message_and_an_error_code(robots: RealRobots, desk: Desk) -> None:
+    results = at_once(desk, *(["--robot", to, *form, "pause"] for form in ([], ["--json"]) for to, *_ in WHY))
     request(robots, "resume")
-    for told_so, told_in_json, (_, name, code, words) in zip(found, found[len(WHY) :], WHY, strict=False):
-        error = objects(told_in_json)[name]["error"]
-        assert (error["code"], words in error["message"]) == (code, True), error
-        assert f": {name}: {words.removeprefix(f'{name}: ')}" in told_so.err
-        assert f"{name}: {name}: " not in told_so.err
+    for readable, as_json, (_, name, code, message) in zip(results, results[len(WHY) :], WHY, strict=False):
+        error = objects(as_json)[name]["error"]
+        assert (error["code"], message in error["message"]) == (code, True), error
+        assert f": {name}: {message.removeprefix(f'{name}: ')}" in readable.err
+        assert f"{name}: {name}: " not in readable.err
     reason, _ = desk.run("--robot", "off-*", "status").err.splitlines()
     assert re.fullmatch(
         r"talk: OFFLINE: (off-\d, ){4}off-\d and 2 more: off-\d is offline, so nothing was sent", reason
     )
 
 
-def test_a_pick_of_no_robot_is_3_and_so_is_no_broker(desk: Desk, broker: Broker) -> None:
-    picks = {"x*": "no robot matches 'x*'", "@nobody": "no robot is in the group 'nobody'"}
-    lines = [["--robot", to, *each.split()] for to in picks for each in ("say hello", "set")]
+def test_a_selection_without_robots_or_a_missing_broker_exits_with_3(desk: Desk, broker: Broker) -> None:
+    selections = {"x*": "no robot matches 'x*'", "@nobody": "no robot is in the group 'nobody'"}
+    lines = [["--robot", to, *command.split()] for to in selections for command in ("say hello", "set")]
     *plain, for_programs = at_once(desk, *lines, ["--robot", "@nobody", "--json", "cancel"])
     for line, done in zip(lines, plain, strict=True):
         assert (done.code, done.out) == (3, "")
-        assert done.err.startswith(f"talk: {picks[line[1]]} at {broker.url}, so nothing was sent")
+        assert done.err.startswith(f"talk: {selections[line[1]]} at {broker.url}, so nothing was sent")
     error = json.loads(for_programs.err)["error"]
     assert (for_programs.code, for_programs.out, error["code"]) == (3, "", "no_server")
-    with Port() as port, Desk(broker, port=port.number) as somebody:
-        done = somebody.run("--robot", "*", "cancel")
+    with Port() as port, Desk(broker, port=port.number) as other_desk:
+        done = other_desk.run("--robot", "*", "cancel")
     assert (done.code, done.out, "talk: can't connect to the broker at mqtt://" in done.err) == (3, "", True), done
 
 
-def test_a_text_that_is_too_long_is_rejected_by_each(robots: RealRobots, desk: Desk) -> None:
+def test_a_text_that_is_too_long_is_rejected_by_each_robot(robots: RealRobots, desk: Desk) -> None:
     for length in (TOO_LONG, FAR_TOO_LONG):
-        for done in at_once(desk, *(["--robot", each, "say", "--wait", "x" * length] for each in PICKS)):
-            found = {(name, state, code) for name, (_, state, code) in told(done).items()}
-            assert found == {(name, "REJECTED", 5) for name in BOTH}
+        for done in at_once(desk, *(["--robot", selection, "say", "--wait", "x" * length] for selection in SELECTIONS)):
+            outcomes = {(name, state, code) for name, (_, state, code) in printed_outcomes(done).items()}
+            assert outcomes == {(name, "REJECTED", 5) for name in BOTH}
             assert (done.code, f"{length:,} characters" in done.err) == (5, True)
     assert not [text for texts in robots.spoken().values() for text in texts if "xx" in text]
 
 
-def test_an_unknown_goal_makes_it_8(robots: RealRobots, desk: Desk) -> None:
-    assert robots["wh-1"].talk.run("say", "--wait", "--id", "mine-alone", "length=0").code == 0
+def test_an_unknown_goal_exits_with_8(robots: RealRobots, desk: Desk) -> None:
+    assert robots["wh-1"].talk.run("say", "--wait", "--id", "only-on-one", "length=0").code == 0
     request(robots, "say", id="known", text=LONG)
     commands = ["wait nobodys", "status nobodys", "cancel nobodys"]
     *unknown, for_programs, known_to_one, known = at_once(
         desk,
-        *(["--robot", to, *each.split()] for to in PICKS for each in commands),
-        ["--robot", PICKS[0], "--json", "wait", "nobodys"],
-        ["--robot", PICKS[1], "status", "mine-alone"],
-        ["--robot", PICKS[0], "cancel", "known", "nobodys"],
+        *(["--robot", to, *command.split()] for to in SELECTIONS for command in commands),
+        ["--robot", SELECTIONS[0], "--json", "wait", "nobodys"],
+        ["--robot", SELECTIONS[1], "status", "only-on-one"],
+        ["--robot", SELECTIONS[0], "cancel", "known", "nobodys"],
     )
     for done in unknown:
-        assert_told(done, 8, alike(BOTH, "-", "UNKNOWN", 8), "0 of 2 robots succeeded")
-    codes = [each["error"]["code"] for each in objects(for_programs).values()]
+        assert_outcomes(done, 8, alike(BOTH, "-", "UNKNOWN", 8), "0 of 2 robots succeeded")
+    codes = [outcome["error"]["code"] for outcome in objects(for_programs).values()]
     assert (for_programs.code, codes) == (8, ["unknown_goal"] * 2)
-    wanted = {"wh-1": ("mine-alone", "SUCCEEDED", 0), "wh-2": ("-", "UNKNOWN", 8)}
-    assert_told(known_to_one, 8, wanted, "1 of 2 robots succeeded")
+    expected = {"wh-1": ("only-on-one", "SUCCEEDED", 0), "wh-2": ("-", "UNKNOWN", 8)}
+    assert_outcomes(known_to_one, 8, expected, "1 of 2 robots succeeded")
     assert sorted(known.out.splitlines()) == [
         f"{name} {rest}" for name in BOTH for rest in ("- UNKNOWN 8", "known PREEMPTED 0")
     ]
     assert (known.code, known.err.splitlines()[-1]) == (8, "talk: 0 of 2 robots succeeded")
 
 
-def test_the_end_of_a_sentence_is_the_exit_code(robots: RealRobots, desk: Desk) -> None:
-    waiting = desk.start("--robot", PICKS[0], "say", "--wait", "--id", "cancelled", "--", LONG)
-    robots.each(lambda each: each.talk.watcher.wait_for("cancelled", "ACTIVE"))
+def test_the_exit_code_follows_from_the_state_of_the_goal(robots: RealRobots, desk: Desk) -> None:
+    waiting = desk.start("--robot", SELECTIONS[0], "say", "--wait", "--id", "cancelled", "--", LONG)
+    robots.each(lambda robot: robot.talk.watcher.wait_for("cancelled", "ACTIVE"))
     request(robots, "cancel")
     assert robots["wh-1"].talk.run("say", "--wait", "--id", "fails-on-one", "length=0").code == 0
     assert robots["wh-2"].talk.run("say", "--wait", "--id", "fails-on-one", "fail=engine_failed").code == 4
     fails, differs = at_once(
         desk,
-        ["--robot", PICKS[1], "say", "--wait", "--id", "fails", "--", "fail=engine_failed"],
-        ["--robot", PICKS[1], "wait", "fails-on-one"],
+        ["--robot", SELECTIONS[1], "say", "--wait", "--id", "fails", "--", "fail=engine_failed"],
+        ["--robot", SELECTIONS[1], "wait", "fails-on-one"],
     )
-    assert_told(desk.finish(waiting), 7, alike(BOTH, "cancelled", "PREEMPTED", 7), "0 of 2 robots succeeded")
-    assert_told(fails, 4, alike(BOTH, "fails", "ABORTED", 4), "0 of 2 robots succeeded")
+    assert_outcomes(desk.finish(waiting), 7, alike(BOTH, "cancelled", "PREEMPTED", 7), "0 of 2 robots succeeded")
+    assert_outcomes(fails, 4, alike(BOTH, "fails", "ABORTED", 4), "0 of 2 robots succeeded")
     assert "talk: ABORTED: " in fails.err
-    wanted = {"wh-1": ("fails-on-one", "SUCCEEDED", 0), "wh-2": ("fails-on-one", "ABORTED", 4)}
-    assert_told(differs, 4, wanted, "1 of 2 robots succeeded")
+    expected = {"wh-1": ("fails-on-one", "SUCCEEDED", 0), "wh-2": ("fails-on-one", "ABORTED", 4)}
+    assert_outcomes(differs, 4, expected, "1 of 2 robots succeeded")

@@ -1,4 +1,4 @@
-"""A short soak of a robot at a broker, or TALK_TEST_SOAK seconds if that is set."""
+"""A short soak test of a fleet. TALK_TEST_SOAK sets another duration in seconds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SECONDS = float(os.environ.get("TALK_TEST_SOAK") or (30 if os.environ.get("CI") 
 
 @pytest.mark.slow
 @pytest.mark.timeout(int(SECONDS) + 600)
-def test_random_goals_over_a_broker_with_a_fault_every_few_seconds() -> None:
+def test_random_goals_end_despite_a_fault_every_few_seconds() -> None:
     needs("mosquitto")
     needs_packages("paho")
     report = soak(SECONDS, seed=random.randrange(1 << 30), every=4, warm_up=20)

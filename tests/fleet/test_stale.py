@@ -1,4 +1,4 @@
-"""Sentences that come late are refused: after a line has stalled, or a robot was suspended."""
+"""Delayed goals are refused: after a connection has stalled, or a robot was suspended."""
 
 from __future__ import annotations
 
@@ -19,69 +19,67 @@ if TYPE_CHECKING:
     from tests.fleet.conftest import MakeRobot
     from tests.support.broker import Broker
 
-#: Seconds after the newest echo that came back for which messages are taken.
+#: Seconds after the newest echo for which messages are accepted.
 STALE = 6.0
-#: Seconds of a stall after which messages are too old, and after which they are not.
+#: Seconds of a stall that makes messages too old, and of one that doesn't.
 TOO_LONG, SHORT = STALE + 1.0, STALE / 2
 
 
 @pytest.fixture
-def stalled(broker: Broker, make_robot: MakeRobot) -> Iterator[tuple[Robot, Proxy]]:
-    """A robot behind a proxy, that has just come online."""
+def proxied(broker: Broker, make_robot: MakeRobot) -> Iterator[tuple[Robot, Proxy]]:
+    """A robot behind a proxy, online."""
     with Proxy(broker.port) as proxy:
         yield make_robot("anna", port=proxy.port), proxy
 
 
-def stall(stalled: tuple[Robot, Proxy], how: str) -> Callable[[], None]:
-    """Suspend the robot, or hold one way of its line; return the function that ends that."""
-    robot, proxy = stalled
-    if how == "suspended":
+def stall(proxied: tuple[Robot, Proxy], fault: str) -> Callable[[], None]:
+    """Suspend the robot, or stall one direction of its connection. Return the function that ends the fault."""
+    robot, proxy = proxied
+    if fault == "suspended":
         robot.bridge.stop_process()
         return robot.bridge.resume_process
-    proxy.hold("to_client" if how == "to_client" else "to_broker")
+    proxy.hold("to_client" if fault == "to_client" else "to_broker")
     return proxy.release
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", ["suspended", "to_client"])
-def test_a_sentence_that_was_held_for_long_is_refused_and_the_next_is_spoken(
-    stalled: tuple[Robot, Proxy], how: str
-) -> None:
-    robot, _ = stalled
+@pytest.mark.parametrize("fault", ["suspended", "to_client"])
+def test_a_goal_delayed_for_7_s_is_refused_and_the_next_is_spoken(proxied: tuple[Robot, Proxy], fault: str) -> None:
+    robot, _ = proxied
     with RemoteClient(robot.broker, "olga") as olga, robot.listen("echo") as listener:
-        began = time.monotonic()
-        go_on = stall(stalled, how)
-        asked = olga.post("say", text="late")
+        started_at = time.monotonic()
+        resume = stall(proxied, fault)
+        seq = olga.post("say", text="late")
         for kind in ("say", "request"):
             olga.send('{"request": "say", "text": "late, too"}', kind=kind, response=None)
-        time.sleep(began + TOO_LONG - time.monotonic())
-        go_on()
-        went_on = time.monotonic()
-        answer = olga.reply(asked)
+        time.sleep(started_at + TOO_LONG - time.monotonic())
+        resume()
+        resumed_at = time.monotonic()
+        answer = olga.reply(seq)
         assert answer["error"]["code"] == "stale", answer
-        # An echo came with the refusal, or within a second before it; nothing that comes after it is old.
-        listener.await_message(lambda each: each.topic.endswith("/echo") and each.arrived > went_on - 1)
+        # A new echo arrived with the refusal or up to a second before it, so later messages aren't stale.
+        listener.await_message(lambda message: message.topic.endswith("/echo") and message.arrived > resumed_at - 1)
         assert robot.desk("say", "--wait", "control").code == 0
     assert robot.spoken == ["control"]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", ["suspended", "to_client", "to_broker"])
-def test_a_sentence_that_was_held_for_a_moment_is_spoken(stalled: tuple[Robot, Proxy], how: str) -> None:
-    robot, _ = stalled
-    with Desk(robot.broker) as somebody:
-        go_on = stall(stalled, how)
-        asked = somebody.start("--robot", "anna", "say", "--wait", "in time")
+@pytest.mark.parametrize("fault", ["suspended", "to_client", "to_broker"])
+def test_a_goal_delayed_for_3_s_is_spoken(proxied: tuple[Robot, Proxy], fault: str) -> None:
+    robot, _ = proxied
+    with Desk(robot.broker) as desk:
+        resume = stall(proxied, fault)
+        client = desk.start("--robot", "anna", "say", "--wait", "in time")
         time.sleep(SHORT)
-        go_on()
-        done = somebody.finish(asked)
+        resume()
+        done = desk.finish(client)
     assert done.code == 0, done
     assert robot.spoken == ["in time"]
 
 
 @pytest.mark.slow
-def test_without_echoes_no_sentence_is_spoken_that_may_be_old(stalled: tuple[Robot, Proxy]) -> None:
-    robot, proxy = stalled
+def test_a_goal_that_may_be_old_is_refused_if_no_echo_returns(proxied: tuple[Robot, Proxy]) -> None:
+    robot, proxy = proxied
     with RemoteClient(robot.broker, "olga") as olga:
         proxy.hold("to_broker")
         early = olga.post("say", text="in time")
@@ -95,38 +93,36 @@ def test_without_echoes_no_sentence_is_spoken_that_may_be_old(stalled: tuple[Rob
     assert robot.spoken == ["in time"]
 
 
-def test_the_expiry_of_a_message_counts_in_the_queue_of_the_robot_too(robot: Robot) -> None:
+def test_the_expiry_of_a_message_also_limits_the_wait_in_the_queue(robot: Robot) -> None:
     robot.talk.run("say", "--", LONG)
     robot.talk.watcher.wait_for(None, "ACTIVE")
     with RemoteClient(robot.broker, "olga") as olga:
         olga.send({"seq": 1, "request": "say", "id": "short", "text": "a", "ttl": 100}, expiry=1)
         olga.send({"seq": 2, "request": "say", "id": "shorter", "text": "b", "ttl": 0.2}, expiry=100)
         olga.send("c", expiry=1, kind="say", response=None)
-        goals = [olga.reply(each)["goal"] for each in (1, 2)]
-        assert [each["ttl"] for each in goals] == [pytest.approx(1, abs=0.2), 0.2]
-        for each in goals:
-            assert robot.talk.watcher.wait_for_terminal(each["id"]) == "RECALLED"
-            assert robot.talk.goal(each["id"])["reason"] == "expired"
+        goals = [olga.reply(seq)["goal"] for seq in (1, 2)]
+        assert [goal["ttl"] for goal in goals] == [pytest.approx(1, abs=0.2), 0.2]
+        for goal in goals:
+            assert robot.talk.watcher.wait_for_terminal(goal["id"]) == "RECALLED"
+            assert robot.talk.goal(goal["id"])["reason"] == "expired"
         robot.talk.watcher.wait_until(lambda _: len(robot.talk.watcher.texts("RECALLED")) == 3)
     first, *others = robot.talk.watcher.texts("RECALLED")
-    assert (first, {*others}) == ("b", {"a", "c"})  # these two are of two sessions
+    assert (first, {*others}) == ("b", {"a", "c"})  # two sessions have no common order
     assert robot.spoken == [LONG]
 
 
 @pytest.mark.slow
-def test_a_sentence_that_was_held_begins_no_later_than_its_ttl_and_six_seconds(
-    stalled: tuple[Robot, Proxy],
-) -> None:
-    robot, proxy = stalled
+def test_a_delayed_goal_expires_within_its_ttl_plus_6_s(proxied: tuple[Robot, Proxy]) -> None:
+    robot, proxy = proxied
     robot.talk.run("say", "--", LONG)
     robot.talk.watcher.wait_for(None, "ACTIVE")
     with RemoteClient(robot.broker, "olga") as olga, contextlib.ExitStack() as stack:
         stack.callback(proxy.release)
-        said = time.monotonic()
+        sent_at = time.monotonic()
         proxy.hold("to_client")
         seq = olga.post("say", text="late", ttl=1, id="late")
         time.sleep(SHORT)
         proxy.release()
         assert olga.reply(seq)["ok"]
         expired = robot.talk.watcher.wait_for("late", "RECALLED")
-        assert robot.talk.watcher.arrived(expired) - said < 1 + STALE
+        assert robot.talk.watcher.arrived(expired) - sent_at < 1 + STALE

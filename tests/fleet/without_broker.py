@@ -35,36 +35,36 @@ class SessionsWithoutBroker:
         self.sessions: RemoteSessions = RemoteSessions("anna", socket, self._publish, lambda: room, lambda: None)
 
     def post(self, fields: object, session: str = "s1", *, correlation: bytes | None = None) -> None:
-        """Send a request, from an object or bytes. An empty payload is a goodbye.
+        """Send an object or bytes as a request. An empty payload is a goodbye.
 
         The user is bob, unless the session is called USER/SESSION.
         """
         payload = fields if isinstance(fields, bytes) else json.dumps(fields).encode()
         full_name = _full_name(session)
         topic = f"talk/robot/anna/request/{full_name.partition('/')[0]}"
-        asked = topics.parse_request(topic)
-        assert asked
+        parsed = topics.parse_request(topic)
+        assert parsed
         message = Message(topic, payload, response=f"talk/reply/{full_name}", correlation=correlation)
         now = self._policy.newest_echo_at = self._boottime()
-        found = self._policy.decide(message, *asked, now)
-        if isinstance(found, policy.Goodbye):
-            self.sessions.handle_goodbye(found.user, found.reply_topic)
+        decision = self._policy.decide(message, *parsed, now)
+        if isinstance(decision, policy.Goodbye):
+            self.sessions.handle_goodbye(decision.user, decision.reply_topic)
         else:
-            assert isinstance(found, policy.RemoteRequest), found
-            self.sessions.submit(found)
+            assert isinstance(decision, policy.RemoteRequest), decision
+            self.sessions.submit(decision)
 
     def lines(self, session: str = "s1") -> list[dict[str, Any]]:
         wanted = f"talk/reply/{_full_name(session)}/anna"
-        return [each for topic, lines in self.published if topic == wanted for each in lines]
+        return [line for topic, lines in self.published if topic == wanted for line in lines]
 
     async def line(self, wanted: Callable[[dict[str, Any]], bool], session: str = "s1") -> dict[str, Any]:
         """Return the first line that matches. It may have been published before this call."""
 
         async def find() -> dict[str, Any]:
-            while not (found := list(filter(wanted, self.lines(session)))):
+            while not (matches := list(filter(wanted, self.lines(session)))):
                 self._more.clear()
                 await self._more.wait()
-            return found[0]
+            return matches[0]
 
         try:
             return await asyncio.wait_for(find(), PATIENCE)
@@ -74,10 +74,10 @@ class SessionsWithoutBroker:
     async def ask(self, fields: dict[str, Any], session: str = "s1") -> dict[str, Any]:
         """Send a request, and return the reply."""
         self.post(fields, session)
-        return await self.line(lambda each: each.get("seq") == fields["seq"] and "ok" in each, session)
+        return await self.line(lambda line: line.get("seq") == fields["seq"] and "ok" in line, session)
 
     def _publish(self, message: Message, _qos: int) -> None:
-        self.published.append((message.topic, [json.loads(each) for each in message.payload.splitlines()]))
+        self.published.append((message.topic, [json.loads(line) for line in message.payload.splitlines()]))
         self._more.set()
 
 

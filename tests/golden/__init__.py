@@ -1,1 +1,1 @@
-"""Help, errors, library and replies, word for word. Refactoring must not change them."""
+"""The exact help, errors, library and replies of `talk`. Refactoring must not change them."""

@@ -1,8 +1,8 @@
-"""Writes the surface of `talk`: help, errors, exit codes, the library, and the replies to each request.
+"""Generates the public surface of `talk`: help, errors, exit codes, the library, and replies to requests.
 
     python -m tests.golden.surface          updates tests/golden/*.txt; `git diff` shows the changes
 
-Each file is one kind of promise. A type stands for each value that differs from run to run.
+Values that differ from run to run are replaced by their types.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 HERE = Path(__file__).parent
 
-#: Command lines that are wrong, or find no server, by command. Each is shown with its exit code and its output.
+#: Arguments by command that are wrong, or that find no server. The exit code and the output are recorded.
 ERRORS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("", (
         "nonsense", "sey hello", "--sockt /x status", "--socket '' status", "--connect-timeout 0 status",
@@ -62,7 +62,7 @@ ERRORS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("doctor", ("now",)),
 )  # fmt: skip
 
-#: A conversation with a server that has the scripted engine: every request, and some that don't exist.
+#: A conversation with a server that has the scripted engine. It contains every request, and invalid ones.
 REQUESTS: tuple[dict[str, Any], ...] = (
     {"request": "hello", "name": "golden"},
     {"seq": 1, "request": "voices"},
@@ -105,69 +105,69 @@ REQUESTS: tuple[dict[str, Any], ...] = (
 
 
 def surface() -> dict[str, str]:
-    """Return the text of each file of the surface by its name."""
-    found = {f"help-{name or 'talk'}": text for name, text in _helps()}
-    return {**found, "errors": _errors(), "library": _library(), "wire": _wire()}
+    """Return the text of each file by its name."""
+    files = {f"help-{name or 'talk'}": text for name, text in _helps()}
+    return {**files, "errors": _errors(), "library": _library(), "wire": _wire()}
 
 
 def write() -> None:
-    """Write all files, and delete those that are no longer needed."""
-    for each in HERE.glob("*.txt"):
-        each.unlink()
+    """Write all files, and delete outdated ones."""
+    for path in HERE.glob("*.txt"):
+        path.unlink()
     for name, text in surface().items():
         (HERE / f"{name}.txt").write_text(text, encoding="utf-8")
 
 
-def _alone(home: str, words: list[str]) -> tuple[int, str, str]:
-    """Run `talk` without a server and without sound; return its exit code and its output, with HOME for its place."""
-    done = run([*TALK, *words], environment(home, TALK_SOCKET=f"{home}/s", COLUMNS="80", PULSE_SERVER="unix:/nowhere"))
+def _run_without_server(home: str, argv: list[str]) -> tuple[int, str, str]:
+    """Run `talk` without a server or sound, and return its exit code and output, with `home` replaced by HOME."""
+    done = run([*TALK, *argv], environment(home, TALK_SOCKET=f"{home}/s", COLUMNS="80", PULSE_SERVER="unix:/nowhere"))
     return done.code, done.out.replace(home, "HOME"), done.err.replace(home, "HOME")
 
 
 def _helps() -> Iterator[tuple[str, str]]:
     with short_directory() as home:
         for name in ("", *COMMANDS):
-            code, out, err = _alone(home, [*([name] if name else []), "--help"])
+            code, out, err = _run_without_server(home, [*([name] if name else []), "--help"])
             assert (code, err) == (0, ""), name
             yield name, out
 
 
 def _errors() -> str:
-    told = []
+    results = []
     with short_directory() as home:
         for line in (f"{command} {words}".strip() for command, lines in ERRORS for words in lines):
-            code, out, err = _alone(home, shlex.split(line))
-            told.append(f"$ talk {line}\n{_indented(out)}{_indented(err, '! ')}= {code}\n")
-    return "\n".join(told)
+            code, out, err = _run_without_server(home, shlex.split(line))
+            results.append(f"$ talk {line}\n{_indented(out)}{_indented(err, '! ')}= {code}\n")
+    return "\n".join(results)
 
 
 def _indented(text: str, mark: str = "  ") -> str:
-    return "".join(f"{mark}{each}\n" for each in text.splitlines())
+    return "".join(f"{mark}{line}\n" for line in text.splitlines())
 
 
 def _library() -> str:
-    """Return the names in `talkcli` with their public members, and the errors."""
+    """Return the public names of `talkcli` with their members, and the errors."""
     lines = [f"__all__ = {talkcli.__all__}"]
     for name in talkcli.__all__:
-        found = getattr(talkcli, name)
-        if isinstance(found, type):
-            lines += ["", f"class {name}", *_members(found)]
+        value = getattr(talkcli, name)
+        if isinstance(value, type):
+            lines += ["", f"class {name}", *_members(value)]
     lines += ["", "errors"]
-    for each in vars(errors).values():
-        if isinstance(each, type) and issubclass(each, errors.TalkError):
-            (base, *_) = each.__bases__
-            lines.append(f"    {each.__name__}({base.__name__}): code {each.code}, exit {each.exit_code}")
+    for value in vars(errors).values():
+        if isinstance(value, type) and issubclass(value, errors.TalkError):
+            (base, *_) = value.__bases__
+            lines.append(f"    {value.__name__}({base.__name__}): code {value.code}, exit {value.exit_code}")
     return "\n".join(lines) + "\n"
 
 
-def _members(found: type) -> Iterator[str]:
-    if hasattr(found, "__members__"):
-        yield from (f"    {each.name} = {each.value}" for each in found)  # type: ignore[attr-defined]
+def _members(kind: type) -> Iterator[str]:
+    if hasattr(kind, "__members__"):
+        yield from (f"    {member.name} = {member.value}" for member in kind)  # type: ignore[attr-defined]
         return
-    if "__init__" in vars(found) and not vars(found).get("__annotations__"):
-        yield f"    def __init__{inspect.signature(found.__init__)}"  # type: ignore[misc]
-    yield from (f"    {name}: {kind}" for name, kind in inspect.get_annotations(found).items())
-    for name, member in sorted(vars(found).items()):
+    if "__init__" in vars(kind) and not vars(kind).get("__annotations__"):
+        yield f"    def __init__{inspect.signature(kind.__init__)}"  # type: ignore[misc]
+    yield from (f"    {name}: {kind}" for name, kind in inspect.get_annotations(kind).items())
+    for name, member in sorted(vars(kind).items()):
         if name.startswith("_"):
             continue
         if isinstance(member, property):
@@ -177,20 +177,20 @@ def _members(found: type) -> Iterator[str]:
 
 
 def _wire() -> str:
-    """Return the replies of a server with the scripted engine to each request, in their order."""
+    """Return the replies of a server with the scripted engine to `REQUESTS`."""
     talk = Talk(scripted=True)
     try:
         with talk.connect() as wire:
             boot = str(wire.greeting["boot"])
-            lines = [f"< {json.dumps(_steady(wire.greeting))}"]
+            lines = [f"< {json.dumps(_stable(wire.greeting))}"]
             for request in REQUESTS:
                 wire.send(request)
                 lines.append(f"> {json.dumps(request)}")
-                # After "resume", the one goal that is left is spoken.
+                # After "resume", the last goal is spoken.
                 awaited = {"ok", "result"} if request.get("request") == "resume" else {"ok"}
                 while awaited:
                     message = wire.receive()
-                    lines.append(f"< {json.dumps(_steady(message))}")
+                    lines.append(f"< {json.dumps(_stable(message))}")
                     awaited -= {"ok"} & message.keys() | {str(message.get("event"))}
         talk.stop()
     finally:
@@ -198,12 +198,12 @@ def _wire() -> str:
     return "\n".join(lines).replace(f"{boot}-", "BOOT-") + "\n"
 
 
-def _steady(value: Any, name: str = "") -> Any:
-    """Return a message with the types of the values that differ from run to run; messages for people stay."""
+def _stable(value: Any, name: str = "") -> Any:
+    """Replace values that differ from run to run by their types, except messages for people."""
     if isinstance(value, dict):
-        return {key: _steady(each, key) for key, each in value.items()}
+        return {key: _stable(item, key) for key, item in value.items()}
     if isinstance(value, list):
-        return [_steady(each) for each in value]
+        return [_stable(item) for item in value]
     if name in VARIES - {"message", "clients"} or name == "boot":
         return "null" if value is None else type(value).__name__
     return value

@@ -1,7 +1,7 @@
-"""The documents' examples by name: each block of code, and which test runs it.
+"""The examples of the documents by name, and the tests that run them.
 
-A name is the heading that the block stands under, with the bold words that begin the paragraph before it, and a number
-from the second one on: "A tour: Speak", "Start #2". So an example that is added has a name that no test has.
+A name consists of the heading, the bold words at the start of the paragraph before the block, and a number from the
+second block on: "A tour: Speak", "Start #2". A new example has a new name, so a test fails until it is run.
 """
 
 from __future__ import annotations
@@ -22,36 +22,36 @@ _PARTS = re.compile(
 
 
 def _blocks() -> dict[str, tuple[str, str]]:
-    found: dict[str, tuple[str, str]] = {}
+    blocks: dict[str, tuple[str, str]] = {}
     heading, lead = "", ""
-    for part in (each for document in DOCUMENTS for each in _PARTS.finditer(document.text)):
+    for part in (part for document in DOCUMENTS for part in _PARTS.finditer(document.text)):
         if part["heading"]:
             heading, lead = part["heading"].replace("`", ""), ""
         elif part["lead"]:
             lead = f": {part['lead']}"
         else:
             name = f"{heading}{lead}"
-            number = 1 + sum(each == name or each.startswith(f"{name} #") for each in found)
-            found[name if number == 1 else f"{name} #{number}"] = part["language"], part["code"]
-    return found
+            number = 1 + sum(existing == name or existing.startswith(f"{name} #") for existing in blocks)
+            blocks[name if number == 1 else f"{name} #{number}"] = part["language"], part["code"]
+    return blocks
 
 
-#: The language and the text of each block, by its name.
+#: The language and the text of each block by its name.
 BLOCKS = _blocks()
-#: Which test runs a block: filled by `runs`.
+#: The test that runs each block, filled by `runs`.
 RUN: dict[str, str] = {}
 
 
 def block(name: str) -> str:
     """Return the text of a block."""
-    assert name in BLOCKS, f"no document has {name!r}; they have: {', '.join(BLOCKS)}"
+    assert name in BLOCKS, f"no document has the example {name!r}; the examples are: {', '.join(BLOCKS)}"
     return BLOCKS[name][1]
 
 
 def commands(name: str) -> list[str]:
-    """Return the commands of a block of which each stands on a line of its own, without the notes beside them."""
-    lines = (re.sub(r"(^|\s)#\s.*$", "", each).strip() for each in block(name).splitlines())
-    return [each for each in lines if each]
+    """Return the commands of a block, which has one command per line, without comments."""
+    lines = (re.sub(r"(^|\s)#\s.*$", "", line).strip() for line in block(name).splitlines())
+    return [line for line in lines if line]
 
 
 def runs(*names: str) -> Callable[[_F], _F]:

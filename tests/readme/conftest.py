@@ -1,4 +1,4 @@
-"""Fixtures for the README's examples: a shell beside a server."""
+"""Fixtures for the examples: shells and their servers."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ if TYPE_CHECKING:
 
 @pytest.fixture
 def speaking(make_talk: MakeTalk, tmp_path_factory: pytest.TempPathFactory) -> Talk:
-    """A server with the real engine that plays to nobody, which takes no time."""
+    """A server with the real engine that writes its sound to a file, which takes no time."""
     return make_talk("--player", f"file:{tmp_path_factory.mktemp('said')}/said.wav", "--rate", "450")
 
 
 @pytest.fixture
 def shell(speaking: Talk, tmp_path: Path) -> Iterator[Shell]:
-    """A shell beside a server with the real engine."""
+    """A shell that uses a server with the real engine."""
     with contextlib.closing(Shell(tmp_path, speaking.env)) as result:
         yield result
 
 
 @pytest.fixture
 def scripted_shell(scripted: Talk, tmp_path: Path) -> Iterator[Shell]:
-    """A shell beside a server with the scripted engine."""
+    """A shell that uses a server with the scripted engine."""
     with contextlib.closing(Shell(tmp_path, scripted.env)) as result:
         yield result

@@ -1,7 +1,7 @@
-"""A shell for the README's examples, with `talk` on its PATH and stand-ins for programs that tests must not touch.
+"""A shell for the examples, with `talk` on its PATH, and stand-ins for programs that tests must not run.
 
-A stand-in records its arguments. Like ssh, that for ssh joins the words of a command with blanks and gives them to a
-shell, so that a mistake in quoting shows.
+A stand-in records its arguments. The stand-in for ssh joins the arguments and passes them to a shell, as ssh does, so
+quoting mistakes are found.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from tests.support.processes import Talk
 
-#: Longest time for one example.
+#: Time limit for an example.
 LIMIT = 30.0
 
 _SSH = """
@@ -41,7 +41,7 @@ fi
 exec sh -c "$*"
 """
 
-#: The filters of the README, for a machine that has no jq.
+#: A replacement for jq that knows the filters of the examples.
 _JQ = """
 import json, sys
 wanted = sys.argv[-1]
@@ -61,10 +61,10 @@ for each in map(json.loads, sys.stdin):
 
 
 class Shell:
-    """Runs examples in a directory of their own; `close()` ends what still runs."""
+    """Runs examples in a directory. `close()` kills running ones."""
 
     def __init__(self, directory: Path, env: Mapping[str, str], *, talk: bool = True) -> None:
-        """With `talk`, put this checkout's program on the PATH."""
+        """If `talk` is true, put the `talk` of this checkout on the PATH."""
         self.directory = directory
         self._bin = directory / "bin"
         self._bin.mkdir()
@@ -75,40 +75,40 @@ class Shell:
         if shutil.which("jq") is None:
             self._python("jq", _JQ)
 
-    def program(self, name: str, script: str, where: Path | None = None) -> None:
-        """Put a program on the PATH, or elsewhere."""
-        path = (where or self._bin) / name
+    def program(self, name: str, script: str, directory: Path | None = None) -> None:
+        """Create a program on the PATH or in another directory."""
+        path = (directory or self._bin) / name
         path.write_text(f"#!/bin/sh\n{script}\n", encoding="utf-8")
         path.chmod(0o755)
 
-    def stand_in(self, name: str, then: str = "exit 0", where: Path | None = None) -> None:
-        """Put a program on the PATH that records its arguments, and then runs this script."""
+    def stand_in(self, name: str, then: str = "exit 0", directory: Path | None = None) -> None:
+        """Create a program that records its arguments, and then runs a script."""
         calls = self.directory / f"{name}.calls"
-        self.program(name, f"{{ printf '%s\\037' \"$@\"; echo; }} >> {calls}\n{then}", where)
+        self.program(name, f"{{ printf '%s\\037' \"$@\"; echo; }} >> {calls}\n{then}", directory)
 
     def ssh(self) -> None:
-        """Put an ssh on the PATH that runs the command here."""
+        """Create an `ssh` that runs the command on this machine."""
         self.stand_in("ssh", _SSH)
 
     def calls(self, name: str) -> list[list[str]]:
         """Return the arguments of each call of a stand-in."""
         path = self.directory / f"{name}.calls"
         lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-        return [each.split("\037")[:-1] for each in lines]
+        return [line.split("\037")[:-1] for line in lines]
 
     def run(self, script: str, *arguments: str, limit: float = LIMIT, **env: str) -> subprocess.CompletedProcess[str]:
-        """Run a script to its end, which must come within `limit` seconds."""
-        began = self.start(script, *arguments, **env)
-        # Until it is reaped, its number is that of its group, so the processes that it left can be ended.
-        wait_until(lambda: os.waitid(os.P_PID, began.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None, limit)
-        os.killpg(began.pid, signal.SIGKILL)
-        out, err = began.communicate(timeout=LIMIT)
+        """Run a script, which must end within `limit` seconds."""
+        process = self.start(script, *arguments, **env)
+        # Until the process is reaped, its id is valid for its group, so its remaining children can be killed.
+        wait_until(lambda: os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None, limit)
+        os.killpg(process.pid, signal.SIGKILL)
+        out, err = process.communicate(timeout=LIMIT)
         assert "Traceback" not in err, err
-        return subprocess.CompletedProcess(script, began.returncode, out, err)
+        return subprocess.CompletedProcess(script, process.returncode, out, err)
 
     def start(self, script: str, *arguments: str, **env: str) -> subprocess.Popen[str]:
-        """Start a script in a session of its own."""
-        began = subprocess.Popen(
+        """Start a script in a new session."""
+        process = subprocess.Popen(
             ["sh", "-c", script, "sh", *arguments],
             env={**self.env, **env},
             cwd=self.directory,
@@ -118,19 +118,19 @@ class Shell:
             text=True,
             start_new_session=True,
         )
-        self._running.append(began)
-        return began
+        self._running.append(process)
+        return process
 
     def wait_for_call(self, name: str, count: int) -> list[list[str]]:
-        """Wait until a stand-in was called so many times; return the calls."""
+        """Wait until a stand-in was called `count` times, and return the calls."""
         wait_until(lambda: len(self.calls(name)) >= count)
         return self.calls(name)
 
     def close(self) -> None:
-        for each in self._running:
-            if each.returncode is None:
-                os.killpg(each.pid, signal.SIGKILL)
-                each.communicate()
+        for process in self._running:
+            if process.returncode is None:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.communicate()
 
     def _python(self, name: str, code: str) -> None:
         path = self.directory / f"{name}.py"
@@ -138,15 +138,15 @@ class Shell:
         self.program(name, f'exec {sys.executable} -u {path} "$@"')
 
 
-def wait_until(true: Callable[[], bool], seconds: float = PATIENCE) -> None:
-    """Wait until a condition holds of which no event tells."""
+def wait_until(condition: Callable[[], bool], seconds: float = PATIENCE) -> None:
+    """Poll a condition until it holds."""
     end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end, "it did not happen"
+    while not condition():
+        assert time.monotonic() < end, f"the condition did not hold within {seconds} s"
         time.sleep(0.02)
 
 
 def wait_for_watcher(talk: Talk) -> None:
-    """Wait until a client watches beside the test's own watcher."""
-    with talk.connect() as wire:  # a closing connection would count
+    """Wait until a client other than the test's own watcher is connected."""
+    with talk.connect() as wire:  # one connection, because a closing one would count
         wait_until(lambda: wire.request("status")["server"]["clients"] > 2)

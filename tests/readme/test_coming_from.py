@@ -1,4 +1,4 @@
-"""The table for users of other programs: the commands and the Python that it recommends work."""
+"""The commands and the Python code in the table for users of other programs."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ if TYPE_CHECKING:
     from tests.readme.shell import Shell
     from tests.support.processes import Talk
 
-NOW = [each for row in tables(COMMAND_LINE.section("Coming from something else"))[0][1:] for each in code_spans(row[2])]
-COMMANDS = [each for each in NOW if re.match("talk [a-z]", each)]
-(PIPE, LOOP) = sorted(each for each in NOW if re.search("[;|] ", each))
-PYTHON = [each for each in NOW if each not in {*COMMANDS, PIPE, LOOP}]
+TABLE = tables(COMMAND_LINE.section("Coming from something else"))[0]
+REPLACEMENTS = [span for row in TABLE[1:] for span in code_spans(row[2])]
+COMMANDS = [span for span in REPLACEMENTS if re.match("talk [a-z]", span)]
+(PIPE, LOOP) = sorted(span for span in REPLACEMENTS if re.search("[;|] ", span))
+PYTHON = [span for span in REPLACEMENTS if span not in {*COMMANDS, PIPE, LOOP}]
 
 
 def test_recommended_commands_and_python_work(speaking: Talk, shell: Shell) -> None:
     (shell.directory / "notes.txt").write_text("first\nsecond\n", encoding="utf-8")
-    for each in dict.fromkeys(COMMANDS):
-        if not each.startswith("talk serve"):  # the tour starts servers
-            done = shell.run(each)
+    for command in dict.fromkeys(COMMANDS):
+        if not command.startswith("talk serve"):  # tests of the tour start servers
+            done = shell.run(command)
             assert done.returncode == 0, done
     assert (shell.directory / "notes.wav").stat().st_size > 1000
-    goals = {each["text"]: each for each in map(speaking.goal, speaking.watcher.goals())}
+    goals = {goal["text"]: goal for goal in map(speaking.goal, speaking.watcher.goals())}
     assert {"first\nsecond", "Guten Tag", "obstacle", "moving on", "mail", "ten percent", "battery low"} <= set(goals)
     assert (goals["obstacle"]["priority"], goals["moving on"]["client"]["name"]) == (10, "patrol")
     assert speaking.request("status")["server"]["paused"] is False
@@ -38,15 +39,15 @@ def test_recommended_commands_and_python_work(speaking: Talk, shell: Shell) -> N
     assert speaking.request("set")["settings"]["rate"] == 150
 
 
-def test_recommended_pipe_speaks_each_line_and_passes_it_on(scripted: Talk, scripted_shell: Shell) -> None:
+def test_the_recommended_pipe_speaks_each_line_and_passes_it_on(scripted: Talk, scripted_shell: Shell) -> None:
     scripted_shell.stand_in("make", "printf 'one\\ntwo\\n'")
     done = scripted_shell.run(PIPE)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "one\ntwo\n")
-    goals = [scripted.goal(each) for each in scripted.watcher.goals()]
-    assert [(each["text"], each["priority"]) for each in goals] == [("one", 5), ("two", 5)]
+    goals = [scripted.goal(goal_id) for goal_id in scripted.watcher.goals()]
+    assert [(goal["text"], goal["priority"]) for goal in goals] == [("one", 5), ("two", 5)]
 
 
-def test_recommended_loop_ends_with_a_cancel(scripted: Talk, scripted_shell: Shell) -> None:
+def test_the_recommended_loop_ends_with_a_cancel(scripted: Talk, scripted_shell: Shell) -> None:
     repeating = scripted_shell.start(LOOP.replace("battery low", "length=0.02"))
     wait_until(lambda: len(scripted.watcher.goals()) > 2)
     while repeating.poll() is None:  # a cancel may come between two goals

@@ -1,4 +1,4 @@
-"""Every example of a document has a test. A new example fails here, by its name, until it has one."""
+"""Each example in the documents has a test. A new example fails here until it has one."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from pathlib import Path
 from tests.readme.blocks import BLOCKS, RUN
 from tests.support.documents import ROOT
 
-#: Examples that tests elsewhere run.
+#: Examples that are run by tests in other folders.
 ELSEWHERE = {
-    "Use it from Python": "tests/wire/test_examples.py::test_first_example_of_the_library",
-    "Use it from Python: In a robot's loop": "tests/wire/test_examples.py::test_loop_of_a_robot",
-    "The wire": "tests/wire/test_examples.py::test_line_of_socat_says_a_sentence",
-    "Two clients": "tests/wire/test_examples.py::test_client_in_shell",
-    "Two clients #2": "tests/wire/test_examples.py::test_client_in_plain_python",
+    "Use it from Python": "tests/wire/test_examples.py::test_the_first_example_of_the_library_prints_the_words",
+    "Use it from Python: In a robot's loop": "tests/wire/test_examples.py::test_the_loop_of_a_robot_speaks",
+    "The wire": "tests/wire/test_examples.py::test_a_goal_can_be_sent_with_socat",
+    "Two clients": "tests/wire/test_examples.py::test_the_shell_client_reports_each_result",
+    "Two clients #2": "tests/wire/test_examples.py::test_the_plain_python_client_prints_the_words",
     "Completion": "tests/test_completion.py::test_the_readmes_start_files_load_the_completion",
     "Speed": "tests/test_bench.py::test_every_row_of_a_group_measures_something",
 }
@@ -30,7 +30,7 @@ def test_every_example_has_a_test() -> None:
     for test in ELSEWHERE.values():
         path, _, name = test.partition("::")
         nodes = ast.walk(ast.parse((ROOT / path).read_text("utf-8")))
-        assert name in [each.name for each in nodes if isinstance(each, ast.FunctionDef)], test
+        assert name in [node.name for node in nodes if isinstance(node, ast.FunctionDef)], test
 
 
 def test_examples_can_be_parsed() -> None:
@@ -42,8 +42,8 @@ def test_examples_can_be_parsed() -> None:
             assert (done.returncode, done.stderr) == (0, ""), name
 
 
-def test_a_text_from_a_variable_follows_two_dashes() -> None:
-    """Such a text may begin with a dash, and would be an option."""
+def test_examples_put_two_dashes_before_a_text_from_a_variable() -> None:
+    """Without them, a text that starts with a dash would be read as an option."""
     for name, (_, code) in BLOCKS.items():
         for line in code.splitlines():
             rest = line.replace("talk -q say", "talk say").partition("talk say")[2]

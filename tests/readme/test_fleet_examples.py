@@ -1,6 +1,6 @@
-"""The examples of a fleet, in the README and in its own document, with a real broker, server and bridge.
+"""The examples for fleets in the README and in the fleet's document, with a real broker, server and bridge.
 
-Settings beside an example name the test's broker and its logins. Stand-ins keep the machine as it is.
+Settings redirect the examples to the test's broker and logins. Stand-ins protect the machine from changes.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ if TYPE_CHECKING:
     from tests.support.mqtt import Message
     from tests.support.processes import Talk
 
-#: The logins of the examples, and how each is proved.
-PASSWORDS = {each: f"password-of-{each}" for each in ("anna", "olga", "ha")}
-#: Where the examples of requests are answered.
+#: The users of the examples and their passwords.
+PASSWORDS = {user: f"password-of-{user}" for user in ("anna", "olga", "ha")}
+#: The response topic in the examples of requests.
 _REPLIES = block("Requests and replies: A request").partition(" -e ")[2].split()[0]
-#: Seconds in which a robot must be online, or have carried out a request.
+#: Time for a robot to come online or to carry out a request.
 LIMIT = 20.0
-#: Runs `talk` with the test's broker in place of the examples'.
+#: Runs `talk` with the test's broker instead of the example's.
 _TALK = f"""if [ "$1" != serve ]; then
     test "$TALK_BROKER" = mqtts://broker -a -n "$TALK_MQTT_PASSWORD_FILE" || exit 99
     export TALK_BROKER=$URL TALK_MQTT_CA=$CA TALK_MQTT_PASSWORD_FILE="$DIRECTORY/$TALK_MQTT_USER.password"
 fi
 exec {sys.executable} -m talkcli "$@"
 """
-#: Writes below a directory of the test, and asks for no password.
+#: Writes into a directory of the test, and doesn't prompt for passwords.
 _SUDO = """program=$1
 shift
 case $program in
@@ -67,7 +67,7 @@ def place() -> Iterator[str]:
 
 @dataclass
 class Site:
-    """A robot, anna, and the shell of a client that has mosquitto's programs and none of talk's."""
+    """The robot anna, and the shell of a client with mosquitto's programs but without `talk`."""
 
     talk: Talk
     broker: Broker
@@ -76,24 +76,24 @@ class Site:
     replies: Listener
 
     def run(self, name: str) -> str:
-        """Run an example, which must succeed, and return its output."""
+        """Run an example that must succeed, and return its output."""
         done = self.shell.run(block(name))
         assert (done.returncode, done.stderr) == (0, ""), done
         return done.stdout
 
     def goal(self, text: str, state: str) -> dict[str, Any]:
-        """Wait until the goal with this text is in this state, and return it."""
-        event = self.talk.watcher.wait_until(lambda each: _tells(each, text, state), LIMIT)
+        """Wait until the goal with this text is in a state, and return the goal."""
+        event = self.talk.watcher.wait_until(lambda event: _is_event(event, text, state), LIMIT)
         goal: dict[str, Any] = event["goal"]
         return goal
 
 
-def _tells(event: dict[str, Any], text: str, state: str) -> bool:
+def _is_event(event: dict[str, Any], text: str, state: str) -> bool:
     return (event.get("goal") or {}).get("text") == text and event.get("state", event["event"]) == state
 
 
-def _says(message: Message, text: str) -> bool:
-    return message.topic.endswith("/event/state") and _tells(message.json, text, "SUCCEEDED")
+def _is_spoken(message: Message, text: str) -> bool:
+    return message.topic.endswith("/event/state") and _is_event(message.json, text, "SUCCEEDED")
 
 
 def _online(message: Message) -> bool:
@@ -101,7 +101,7 @@ def _online(message: Message) -> bool:
 
 
 def _set_up_clients(shell: Shell, broker: Broker, user: str | None = None) -> None:
-    """Write the files that tell mosquitto's clients the broker and the login."""
+    """Write the configuration of mosquitto's clients with the broker and the login."""
     lines = [f"-h {'localhost' if broker.secure else '127.0.0.1'}", f"-p {broker.port}"]
     if user:
         lines += [f"-u {user}", f"-P {PASSWORDS[user]}"]
@@ -109,9 +109,9 @@ def _set_up_clients(shell: Shell, broker: Broker, user: str | None = None) -> No
         lines.append(f"--cafile {authority().file}")
     files = shell.directory / ".config"
     files.mkdir()
-    for each in ("mosquitto_pub", "mosquitto_sub", "mosquitto_rr"):
-        needs(each)
-        (files / each).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    for program in ("mosquitto_pub", "mosquitto_sub", "mosquitto_rr"):
+        needs(program)
+        (files / program).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 @pytest.fixture
@@ -131,14 +131,14 @@ def site(make_talk: MakeTalk, tmp_path: Path, place: str) -> Iterator[Site]:
 
 
 @runs("Speak on many robots: On each robot", "Speak on many robots: On your machine")
-def test_readmes_robot_and_its_desk(tmp_path: Path, place: str) -> None:
-    """Two commands set up a robot with logins and the broker's rules. A desk and a plain text make it speak."""
+def test_a_robot_and_a_desk_are_set_up(tmp_path: Path, place: str) -> None:
+    """The broker has logins and access rules. The robot speaks a goal from a desk, and a plain text."""
     needs_packages("paho")
     operators = ("olga", "ha")
     with contextlib.ExitStack() as stack:
         broker = stack.enter_context(Broker(secure=True, users=PASSWORDS, acl=topics.access_rules(operators) + "\n"))
         for user in PASSWORDS:
-            broker.env(user)  # it writes the file of the password
+            broker.env(user)  # this writes the password file
         env = clean_environment(place) | {"TALK_SOCKET": f"{place}/s", "TALK_PLAYER": "null", "TALK_RATE": "450"}
         shell = stack.enter_context(contextlib.closing(Shell(tmp_path, env, talk=False)))
         shell.env |= {"URL": broker.url, "CA": str(authority().file), "DIRECTORY": str(broker.directory)}
@@ -150,15 +150,15 @@ def test_readmes_robot_and_its_desk(tmp_path: Path, place: str) -> None:
         done = shell.run(block("Speak on many robots: On your machine"), TALK_SOCKET="/nowhere")
         assert (done.returncode, done.stderr) == (0, ""), done
         assert "exit code" not in done.stdout
-        listener.await_message(lambda each: _says(each, "the shift is over"), LIMIT)
+        listener.await_message(lambda message: _is_spoken(message, "the shift is over"), LIMIT)
         done = shell.run(commands("Topics")[0])
         assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-        found = listener.await_message(lambda each: _says(each, "the washing is done"), LIMIT)
-        assert found.json["goal"]["client"]["name"] == "mqtt:ha"
+        message = listener.await_message(lambda message: _is_spoken(message, "the washing is done"), LIMIT)
+        assert message.json["goal"]["client"]["name"] == "mqtt:ha"
 
 
 @runs("Speak on many robots: Several robots", "Several robots: In Python")
-def test_several_robots(tmp_path: Path, place: str) -> None:
+def test_several_robots_are_commanded(tmp_path: Path, place: str) -> None:
     needs_packages("paho")
     say, cancel, status, table, follow = commands("Speak on many robots: Several robots")
     with contextlib.ExitStack() as stack:
@@ -180,8 +180,8 @@ def test_several_robots(tmp_path: Path, place: str) -> None:
         python.write_text(code, encoding="utf-8")
         done = shell.run(f"{sys.executable} several.py", PYTHONPATH=str(ROOT))
         assert (done.returncode, done.stderr) == (0, "")
-        assert sorted(done.stdout.splitlines()) == [f"{each} SUCCEEDED 0" for each in robots.names]
-        assert robots.spoken() == {each: ["the shift is over"] * (2 if "wh" in each else 1) for each in robots.names}
+        assert sorted(done.stdout.splitlines()) == [f"{name} SUCCEEDED 0" for name in robots.names]
+        assert robots.spoken() == {name: ["the shift is over"] * (2 if "wh" in name else 1) for name in robots.names}
 
         assert robots["bert"].bridge.terminate() == 0
         done = shell.run(status)
@@ -191,8 +191,8 @@ def test_several_robots(tmp_path: Path, place: str) -> None:
 
 
 @runs("Set up a site")
-def test_broker_is_set_up(make_talk: MakeTalk, tmp_path: Path, place: str) -> None:
-    """The broker lets in those logins alone, by TLS, each for its own rights."""
+def test_a_broker_with_logins_is_set_up(make_talk: MakeTalk, tmp_path: Path, place: str) -> None:
+    """The broker accepts only these logins, only with TLS, and each with its own rights."""
     needs_packages("paho")
     needs("mosquitto_passwd")
     etc = tmp_path / "etc"
@@ -201,11 +201,11 @@ def test_broker_is_set_up(make_talk: MakeTalk, tmp_path: Path, place: str) -> No
         shell.stand_in("sudo", _SUDO.replace("ETC", str(etc)).replace("PROGRAM", str(find_program("mosquitto_passwd"))))
         done = shell.run(block("Set up a site"))
         assert done.returncode == 0, done
-        called = [each[0] for each in shell.calls("sudo")]
+        called = [call[0] for call in shell.calls("sudo")]
     assert called == ["apt-get", "mosquitto_passwd", "mosquitto_passwd", "tee", "tee", "systemctl"]
-    settings = dict(each.split(" ", 1) for each in (etc / "conf.d/talk.conf").read_text("utf-8").splitlines())
+    settings = dict(line.split(" ", 1) for line in (etc / "conf.d/talk.conf").read_text("utf-8").splitlines())
     assert settings.pop("listener") == "8883"
-    # Where the certificate is, and the port, only the test knows.
+    # The test uses its own certificate and port.
     assert settings.keys() - {"password_file", "acl_file"} == {"certfile", "keyfile"}
     kept = [f"{name} {settings[name].replace('/etc/mosquitto', str(etc))}" for name in ("password_file", "acl_file")]
     with contextlib.ExitStack() as stack:
@@ -226,7 +226,7 @@ def test_broker_is_set_up(make_talk: MakeTalk, tmp_path: Path, place: str) -> No
     "Requests and replies: A request #3",
     "Requests and replies: A session",
 )
-def test_plain_texts_requests_and_sessions(site: Site) -> None:
+def test_plain_texts_requests_and_sessions_work(site: Site) -> None:
     site.talk.request("pause")  # otherwise the text may already have been spoken
     assert site.run("Topics") == ""
     goal = site.goal("the washing is done", "RECALLED")
@@ -236,8 +236,8 @@ def test_plain_texts_requests_and_sessions(site: Site) -> None:
     answer = json.loads(site.run("Requests and replies: A request").splitlines()[0])
     assert _part(answer, example) == example
     site.goal("the door is open", "SUCCEEDED")
-    ended = re.compile(rb'"event": ?"result"')  # after this line, the next request gets no reply to the first
-    site.replies.await_message(lambda each: bool(ended.search(each.payload)), LIMIT)
+    ended = re.compile(rb'"event": ?"result"')  # after the result, the next request gets only its own reply
+    site.replies.await_message(lambda message: bool(ended.search(message.payload)), LIMIT)
     again = json.loads(site.run("Requests and replies: A request").splitlines()[0])
     assert again["attached"] is True
     assert site.run("Requests and replies: A request #3") == ""
@@ -250,36 +250,36 @@ def test_plain_texts_requests_and_sessions(site: Site) -> None:
 
 
 def _part(whole: Any, like: Any) -> Any:
-    """Return the part of an object that an example shows."""
+    """Return only those fields of an object that the example shows."""
     return {name: _part(whole[name], value) for name, value in like.items()} if isinstance(like, dict) else whole
 
 
 @runs(
-    *(f"What a robot publishes: Presence{each}" for each in ("", " #2", " #3")),
+    *(f"What a robot publishes: Presence{number}" for number in ("", " #2", " #3")),
     "What a robot publishes: Status",
     "What a robot publishes: Status #2",
     "What a robot publishes: Events",
 )
-def test_events_status_and_presence(site: Site) -> None:
+def test_a_robot_publishes_events_status_and_presence(site: Site) -> None:
     before = site.broker.log.count("SUBACK")
     following = site.shell.start(block("What a robot publishes: Events"))
     wait_until(lambda: site.broker.log.count("SUBACK") > before)
     site.run("Requests and replies: A request")
     goal = site.goal("the door is open", "SUCCEEDED")
     assert following.stdout
-    events = [each for each in itertools.islice(following.stdout, 6) if each.strip()][:3]
-    assert [each.partition(" ")[0] for each in events] == ["talk/robot/anna/event/state"] * 3
-    states = [json.loads(each.partition(" ")[2])["state"] for each in events]
+    events = [line for line in itertools.islice(following.stdout, 6) if line.strip()][:3]
+    assert [line.partition(" ")[0] for line in events] == ["talk/robot/anna/event/state"] * 3
+    states = [json.loads(line.partition(" ")[2])["state"] for line in events]
     assert states == ["PENDING", "ACTIVE", "SUCCEEDED"]
 
     example = json.loads(block("What a robot publishes: Status #2"))
     example["last"]["at"] = goal["ended_at"]
-    wait_until(lambda: bool(json.loads(site.run("What a robot publishes: Status")) == example))  # one per second
+    wait_until(lambda: bool(json.loads(site.run("What a robot publishes: Status")) == example))  # once a second
 
-    there, gone = (json.loads(block(f"What a robot publishes: Presence #{each}")) for each in (2, 3))
-    found = json.loads(site.run("What a robot publishes: Presence"))
+    online, gone = (json.loads(block(f"What a robot publishes: Presence #{number}")) for number in (2, 3))
+    presence = json.loads(site.run("What a robot publishes: Presence"))
     vary = dict.fromkeys(("server", "session", "since", "version"))
-    assert (found.keys(), found["server"].keys()) == (there.keys(), there["server"].keys())
-    assert {**found, **vary} == {**there, **vary}
+    assert (presence.keys(), presence["server"].keys()) == (online.keys(), online["server"].keys())
+    assert {**presence, **vary} == {**online, **vary}
     site.bridge.terminate()
-    assert json.loads(site.run("What a robot publishes: Presence")) == {**gone, "session": found["session"]}
+    assert json.loads(site.run("What a robot publishes: Presence")) == {**gone, "session": presence["session"]}

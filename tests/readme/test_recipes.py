@@ -1,4 +1,4 @@
-"""The examples of recipes, containers, services and troubleshooting, with stand-ins that keep the machine as it is."""
+"""The examples for recipes, containers, services and troubleshooting. Stand-ins protect the machine from changes."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ if TYPE_CHECKING:
 AWKWARD = "it's \"5\" o'clock; $HOME & `more` -- \\n"
 
 
-def said(talk: Talk) -> list[str]:
-    """Return the texts of all goals, in their order."""
-    return [talk.goal(each)["text"] for each in talk.watcher.goals()]
+def texts_of(talk: Talk) -> list[str]:
+    """Return the texts of all goals in their order."""
+    return [talk.goal(goal_id)["text"] for goal_id in talk.watcher.goals()]
 
 
 @runs("Recipes: Drive only if it was heard")
-def test_drive_only_if_it_was_heard(scripted: Talk, scripted_shell: Shell) -> None:
+def test_a_robot_drives_only_if_the_goal_was_spoken(scripted: Talk, scripted_shell: Shell) -> None:
     script = block("Recipes: Drive only if it was heard")
     for name in ("drive", "flash"):
-        scripted_shell.stand_in(name, where=scripted_shell.directory)
+        scripted_shell.stand_in(name, directory=scripted_shell.directory)
     assert scripted_shell.run(script, "length=0").returncode == 0
     assert (len(scripted_shell.calls("drive")), len(scripted_shell.calls("flash"))) == (1, 0)
     assert "no loudspeaker" in scripted_shell.run(script, "fail=audio_device").stdout
@@ -55,53 +55,53 @@ def test_a_growing_text(speaking: Talk) -> None:
 
 
 @runs("Recipes: Battery guard")
-def test_battery_guard(scripted: Talk, scripted_shell: Shell) -> None:
+def test_the_battery_guard_warns_once_and_stops(scripted: Talk, scripted_shell: Shell) -> None:
     battery = scripted_shell.directory / "capacity"
     for charge in ("80", "19", "18", "4"):
         battery.write_text(f"{charge}\n", encoding="utf-8")
         done = scripted_shell.run(block("Recipes: Battery guard"), BATTERY=str(battery))
-        assert (done.returncode, done.stdout, done.stderr) == (0, "", ""), done  # 18: throttled
-    assert said(scripted)[:1] == ["battery at 19 percent"]
-    assert [each for each in said(scripted) if "stop" in each] == ["battery at 4 percent, I have to stop"]
+        assert (done.returncode, done.stdout, done.stderr) == (0, "", ""), done  # the goal at 18 is throttled
+    assert texts_of(scripted)[:1] == ["battery at 19 percent"]
+    assert [text for text in texts_of(scripted) if "stop" in text] == ["battery at 4 percent, I have to stop"]
 
 
 @runs("Recipes: Speak a log")
-def test_log_to_speech(scripted: Talk, scripted_shell: Shell) -> None:
+def test_errors_of_a_log_are_spoken(scripted: Talk, scripted_shell: Shell) -> None:
     scripted_shell.stand_in("tail", "printf 'INFO fine\\n12:00 ERROR -5 degrees\\nINFO\\nERROR arm blocked\\n'")
     done = scripted_shell.run(block("Recipes: Speak a log"))
     assert done.returncode == 0, done
     assert scripted_shell.calls("tail") == [["-n", "0", "-F", "/var/log/robot.log"]]
-    assert said(scripted) == ["ERROR -5 degrees", "ERROR arm blocked"]
+    assert texts_of(scripted) == ["ERROR -5 degrees", "ERROR arm blocked"]
 
 
 @runs("More recipes: Mute the microphone")
-def test_microphone_mute(scripted: Talk, scripted_shell: Shell) -> None:
+def test_the_microphone_is_muted_while_the_robot_speaks(scripted: Talk, scripted_shell: Shell) -> None:
     scripted_shell.stand_in("wpctl")
     heard = scripted_shell.directory / "heard"
     scripted_shell.program("talk", f'{sys.executable} -m talkcli "$@" | tee {heard}')
     scripted_shell.start(block("More recipes: Mute the microphone"))
-    wait_until(lambda: heard.exists() and heard.stat().st_size > 0)  # it begins with what there is now
+    wait_until(lambda: heard.exists() and heard.stat().st_size > 0)  # the snapshot has arrived
     for number, text in enumerate(("one", "fail=audio_lost"), 1):
         scripted.run("say", "--wait", "--", text)
         calls = scripted_shell.wait_for_call("wpctl", 2 * number)
-        assert calls[-2:] == [["set-mute", "@DEFAULT_AUDIO_SOURCE@", each] for each in "10"]
+        assert calls[-2:] == [["set-mute", "@DEFAULT_AUDIO_SOURCE@", value] for value in "10"]
     scripted.run("say", "--", "never-ends")
     scripted_shell.wait_for_call("wpctl", 5)
     scripted.kill()
-    assert [each[-1] for each in scripted_shell.wait_for_call("wpctl", 6)[-2:]] == ["1", "0"]
+    assert [call[-1] for call in scripted_shell.wait_for_call("wpctl", 6)[-2:]] == ["1", "0"]
 
 
 @runs("More recipes: Watchdog")
-def test_watchdog(scripted: Talk, scripted_shell: Shell) -> None:
-    for words, code in ((["true"], 0), (["sh", "-c", "exit 3"], 3), (["/bin/sh", "-c", "kill -9 $$"], 137)):
-        assert scripted_shell.run(block("More recipes: Watchdog"), *words).returncode == code
+def test_the_watchdog_reports_how_a_program_ended(scripted: Talk, scripted_shell: Shell) -> None:
+    for command, code in ((["true"], 0), (["sh", "-c", "exit 3"], 3), (["/bin/sh", "-c", "kill -9 $$"], 137)):
+        assert scripted_shell.run(block("More recipes: Watchdog"), *command).returncode == code
     ends = ("true is done", "sh failed with code 3", "sh was killed by signal 9")
-    assert said(scripted) == [f"I have stopped: {each}" for each in ends]
+    assert texts_of(scripted) == [f"I have stopped: {end}" for end in ends]
 
 
 @runs("More recipes: cron")
-def test_cron(speaking: Talk, shell: Shell) -> None:
-    """Like cron: its own PATH, hardly any variables, and a percent sign is a newline unless it is escaped."""
+def test_cron_jobs_run_without_output(speaking: Talk, shell: Shell) -> None:
+    """cron sets its own PATH and few variables, and reads an unescaped percent sign as a newline."""
     shell.stand_in("logger")
     path, *jobs = block("More recipes: cron").splitlines()
     assert path.startswith("PATH=/usr/local/bin:")
@@ -116,14 +116,14 @@ def test_cron(speaking: Talk, shell: Shell) -> None:
             timeout=30,
             check=False,
         )
-        assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")  # cron mails the output
-    (clock,) = said(speaking)
+        assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")  # cron would mail any output
+    (clock,) = texts_of(speaking)
     assert (clock.startswith("It is "), clock.endswith(" o'clock")) == (True, True)
     assert shell.calls("logger") == [["-t", "talk", "the robot is mute"]]  # its player is a file
 
 
 @runs("Recipes: ssh", "More recipes: Forward the socket")
-def test_ssh(speaking: Talk, shell: Shell) -> None:
+def test_talk_works_over_ssh(speaking: Talk, shell: Shell) -> None:
     shell.ssh()
     done = shell.run(block("Recipes: ssh"), text=AWKWARD)
     assert (done.returncode, done.stderr, "not heard" in done.stdout) == (0, "", False)
@@ -131,17 +131,17 @@ def test_ssh(speaking: Talk, shell: Shell) -> None:
         done = shell.run(block("More recipes: Forward the socket"), HOME=home)
         assert (done.returncode, done.stderr) == (0, "")
         assert shell.calls("ssh")[-1][-3:] == ["-L", f"{home}/.robot.sock:{speaking.socket}", "robot"]
-    assert said(speaking) == ["hello from the office", AWKWARD, "hello from the office"]
+    assert texts_of(speaking) == ["hello from the office", AWKWARD, "hello from the office"]
     speaking.stop()
     assert "not heard\n" in shell.run(block("Recipes: ssh"), text=AWKWARD).stdout
 
 
 @runs("In a ROS 2 launch file")
-def test_launch_file(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_launch_file_starts_a_server(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     launch, actions = types.ModuleType("launch"), types.ModuleType("launch.actions")
     launch.__dict__["LaunchDescription"], actions.__dict__["ExecuteProcess"] = list, types.SimpleNamespace
-    for each in (launch, actions):
-        monkeypatch.setitem(sys.modules, each.__name__, each)
+    for module in (launch, actions):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
     file: dict[str, Any] = {}
     exec(block("In a ROS 2 launch file"), file)
     (process,) = file["generate_launch_description"]()
@@ -149,32 +149,32 @@ def test_launch_file(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
         env = {**shell.env, "TALK_SOCKET": f"{place}/s", "TALK_PLAYER": "null"}
         with serving(env, command=[*TALK, *process.cmd[1:]]) as server:
             wait_until(lambda: '"ready"' in server.log)  # the greeting was spoken
-            assert server.end(signal.SIGINT) == 0  # as launch does
+            assert server.end(signal.SIGINT) == 0  # launch stops it this way
 
 
 @runs("In simulation and CI")
-def test_simulation(tmp_path: Path, speaking: Talk) -> None:
+def test_a_simulated_robot_speaks_without_sound(tmp_path: Path, speaking: Talk) -> None:
     with short_directory() as place, contextlib.closing(Shell(tmp_path, speaking.env)) as shell:
         done = shell.run(block("In simulation and CI"), TALK_SOCKET=f"{place}/s")
     assert done.returncode == 0, done
     assert done.stdout.splitlines()[1:] == ["as on the robot"]
 
 
-#: `docker exec talk COMMAND`, here.
+#: Runs `docker exec talk COMMAND` on this machine.
 _DOCKER = """case $1 in exec) shift 2; exec "$@" ;; *) exit 0 ;; esac"""
 #: `sudo tee FILE` writes into the directory of the test.
 _SUDO = """case $1 in tee) mkdir -p system; exec tee "system/${2##*/}" ;; *) exit 0 ;; esac"""
 
 
 @runs("In a container")
-def test_dockerfile() -> None:
+def test_the_dockerfile_starts_a_server() -> None:
     lines = block("In a container").splitlines()
-    assert [each.split()[0] for each in lines] == ["FROM", "RUN", "COPY", "RUN", "CMD"]
+    assert [line.split()[0] for line in lines] == ["FROM", "RUN", "COPY", "RUN", "CMD"]
     assert json.loads(lines[-1].removeprefix("CMD")) == ["talk", "serve"]
 
 
 @runs("In a container #2", "In a container #3")
-def test_containers(speaking: Talk, shell: Shell) -> None:
+def test_containers_can_play_through_the_host(speaking: Talk, shell: Shell) -> None:
     shell.stand_in("docker", _DOCKER)
     shell.stand_in("getent", "echo audio:x:29:")
     done = shell.run(block("In a container #2"))
@@ -190,7 +190,7 @@ def test_containers(speaking: Talk, shell: Shell) -> None:
 
 
 @runs("Run it as a service")
-def test_services(shell: Shell) -> None:
+def test_services_are_installed(shell: Shell) -> None:
     for name, then in {"sudo": _SUDO, "systemctl": "exit 0", "loginctl": "exit 0"}.items():
         shell.stand_in(name, then)
     done = shell.run(block("Run it as a service"))
@@ -200,12 +200,12 @@ def test_services(shell: Shell) -> None:
         assert re.search(f"(?m)^ExecStart=.* serve {option}", (shell.directory / unit).read_text(encoding="utf-8"))
     assert shell.calls("systemctl") == [["--user", "daemon-reload"], ["--user", "enable", "--now", "talk"]]
     assert shell.calls("loginctl") == [["enable-linger"]]
-    called = [" ".join(each) for each in shell.calls("sudo")[1:]]
+    called = [" ".join(call) for call in shell.calls("sudo")[1:]]
     assert called == ["systemctl daemon-reload", "systemctl enable --now talk", "usermod -aG audio NAME"]
 
 
 @runs("Troubleshooting", "Another talk")
-def test_troubleshooting(shell: Shell) -> None:
+def test_troubleshooting_commands_work(shell: Shell) -> None:
     shell.ssh()
     done = shell.run(block("Troubleshooting"))
     assert done.returncode == 0, done

@@ -1,4 +1,4 @@
-"""The documents: tables made from the code, commands in sentences, and links that lead somewhere."""
+"""The documents' generated tables, commands in sentences, links and file names."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from talkcli.cli.commands import COMMANDS
 from tests.readme import reference
 from tests.support.documents import COMMAND_LINE, CONTRIBUTING, DOCUMENTS, INTERNALS, ROOT, Document, code_spans, tables
 
-#: Variables that `talk` sets for its own processes.
+#: Variables that `talk` sets only for its own processes.
 INTERNAL = {"TALK_LIVENESS_FD"}
-#: The ways in which the code reads a variable. A variable of `talk` may also be a constant.
+#: Patterns of code that reads a variable, or that defines a constant with its name.
 READ = (
     r'environ(?:ment)?(?:\.get\(|\[)"(\w+)"',
     r'"(\w+)" (?:not )?in (?:\w+\.)?environ',
@@ -26,55 +26,55 @@ READ = (
 _BEFORE = r"talk (?:--socket \S+ |--robot \S+ |--json |-q )*"
 
 
-@pytest.mark.parametrize("name", reference.MADE)
+@pytest.mark.parametrize("name", reference.TABLES)
 def test_generated_tables_are_current(name: str) -> None:
-    """To update them: `python -m tests.readme.reference`."""
-    document, _ = reference.MADE[name]
+    """`python -m tests.readme.reference` updates them."""
+    document, _ = reference.TABLES[name]
     assert reference.current(name) == document.text
 
 
 def test_variables_are_in_the_table() -> None:
-    sources = [each.read_text(encoding="utf-8") for each in (ROOT / "talkcli").rglob("*.py")]
-    read = {name for each in sources for form in READ for name in re.findall(form, each, re.MULTILINE)}
-    documented = [each for row in tables(COMMAND_LINE.section("Variables"))[0][1:] for each in code_spans(row[0])]
+    sources = [path.read_text(encoding="utf-8") for path in (ROOT / "talkcli").rglob("*.py")]
+    read = {name for source in sources for form in READ for name in re.findall(form, source, re.MULTILINE)}
+    documented = [name for row in tables(COMMAND_LINE.section("Variables"))[0][1:] for name in code_spans(row[0])]
     assert sorted(documented) == sorted(read - INTERNAL)
 
 
-def test_commands_in_sentences_can_be_parsed() -> None:
-    """A command without its text or its goals is a name, and has no option."""
+def test_commands_within_sentences_can_be_parsed() -> None:
+    """A `say` without a text gets one, because a sentence may name only the command or an option."""
     form = re.compile(rf"`((?:sudo |ssh robot )?{_BEFORE}([a-z]+)[^`\n]*)`")
-    found = {line for document in DOCUMENTS for line, name in form.findall(document.text) if name in COMMANDS}
-    assert len(found) > 30
-    for line in found:
+    commands = {line for document in DOCUMENTS for line, name in form.findall(document.text) if name in COMMANDS}
+    assert len(commands) > 30
+    for line in commands:
         name, *arguments = shlex.split(re.sub(f"^.*?{_BEFORE}", "", line.partition(" < ")[0]))
         command = talk.get_command(click.Context(talk), name)
         assert command
-        if arguments == ["--ttl"]:  # names the option
+        if arguments == ["--ttl"]:  # a sentence names the option without a value
             arguments.append("5")
-        if name == "say" and all(each.startswith("--") or each in {"-o", "-f", "-wf"} for each in arguments):
+        if name == "say" and all(part.startswith("--") or part in {"-o", "-f", "-wf"} for part in arguments):
             arguments = ["text"] if arguments in (["-o"], ["-wf"], ["-f"]) else [*arguments, "text"]
         command.make_context(name, arguments, parent=click.Context(talk))
 
 
 LINK = re.compile(r"\[[^\]]*\]\(([^)]+)\)")
-#: A file of the project that a sentence names, from the top or within the package.
+#: A path relative to the project or to the package.
 PATH = re.compile(r"`((?:[.\w]+/)+[\w-]+\.(?:py|md|txt|svg))`")
-BY_PATH = {each.path: each for each in DOCUMENTS}
+BY_PATH = {document.path: document for document in DOCUMENTS}
 
 
 def test_every_document_is_tested() -> None:
     folders = (".github", "completions", "talkcli", "tests")
-    found = {ROOT / "README.md", *(each for folder in folders for each in (ROOT / folder).rglob("*.md"))}
-    assert found == set(BY_PATH)
+    paths = {ROOT / "README.md", *(path for folder in folders for path in (ROOT / folder).rglob("*.md"))}
+    assert paths == set(BY_PATH)
 
 
-def test_links_and_files_are_found() -> None:
+def test_links_and_file_names_are_recognized() -> None:
     assert len({link for document in DOCUMENTS for link in LINK.findall(document.prose)}) > 10
     assert len({path for document in (INTERNALS, CONTRIBUTING) for path in PATH.findall(document.text)}) > 10
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda each: each.name)
-def test_links_lead_somewhere(document: Document) -> None:
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda document: document.name)
+def test_the_target_of_each_link_exists(document: Document) -> None:
     for link in LINK.findall(document.prose):
         if link.startswith("https://"):
             continue
@@ -84,13 +84,13 @@ def test_links_lead_somewhere(document: Document) -> None:
         assert not anchor or anchor in BY_PATH[path].anchors, link
 
 
-@pytest.mark.parametrize("document", [INTERNALS, CONTRIBUTING], ids=lambda each: each.name)
+@pytest.mark.parametrize("document", [INTERNALS, CONTRIBUTING], ids=lambda document: document.name)
 def test_files_that_are_named_exist(document: Document) -> None:
     for path in PATH.findall(document.text):
         assert (ROOT / path).exists() or (ROOT / "talkcli" / path).exists(), path
 
 
-def test_the_tests_of_each_part_exist() -> None:
-    """Contributors run these lines, and pytest stops at a file that isn't there."""
+def test_the_test_files_named_in_contributing_exist() -> None:
+    """pytest stops if a file in such a command is missing."""
     for pattern in re.findall(r"\btests/[\w/*.]+", CONTRIBUTING.section("Set up, and test")):
         assert any(ROOT.glob(pattern)), pattern

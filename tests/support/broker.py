@@ -89,18 +89,15 @@ class Broker(contextlib.AbstractContextManager["Broker"]):
 
     @property
     def url(self) -> str:
-        """The URL for clients."""
         return self.url_at(self.port)
 
     @property
     def log(self) -> str:
-        """The broker's log so far."""
         with open(f"{self.directory}/log", encoding="utf-8", errors="replace") as file:
             return file.read()
 
     @property
     def pid(self) -> int:
-        """The process id of the broker."""
         return self._running().pid
 
     def url_at(self, port: int) -> str:

@@ -61,7 +61,7 @@ class Comparison:
     heard: float  # seconds from the first to the last sound in the recording
     expected: float  # seconds from the first to the last sound in the reference
     #: indexes of the equal samples in the recording and in the reference's sound, if they were compared one by one
-    places: tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]] | None = None
+    indexes: tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]] | None = None
 
     @property
     def same(self) -> bool:
@@ -75,7 +75,7 @@ class Comparison:
     @property
     def end(self) -> int:
         """The index after the last compared sample of the recording."""
-        return int(self.places[0][-1]) + 1 if self.places else self.offset + round(self.expected * RATE)
+        return int(self.indexes[0][-1]) + 1 if self.indexes else self.offset + round(self.expected * RATE)
 
 
 def _samples(heard: Recording | Samples) -> Samples:
@@ -95,11 +95,11 @@ def compare(heard: Recording | Samples, reference: Samples) -> Comparison:
     found = extent(samples)
     if found is None:
         return Comparison(0.0, 0.0, 0, 0.0, len(wanted) / RATE)
-    exact = _exact(samples, wanted, found[0])
+    exact = _compare_exactly(samples, wanted, found[0])
     if exact and extent(samples[exact.end + _SLACK :]) is None:
         return exact
     offset = _align(samples.astype(np.float64), wanted)
-    return _at(samples, wanted, offset, (found[1] - found[0]) / RATE)
+    return _compare_at(samples, wanted, offset, (found[1] - found[0]) / RATE)
 
 
 def assert_heard(heard: Recording | Samples, references: Sequence[Samples]) -> list[Comparison]:
@@ -118,7 +118,7 @@ def assert_heard(heard: Recording | Samples, references: Sequence[Samples]) -> l
         comparison = _compare_next(samples, wanted, start)
         assert comparison.same, (
             f"sentence {number} of {len(references)} was not heard correctly: {_describe(samples, [comparison])}; "
-            f"equal samples (recording, reference, count): {_walk(samples, wanted, start)} of {len(wanted)}"
+            f"equal samples (recording, reference, count): {_equal_runs(samples, wanted, start)} of {len(wanted)}"
         )
         cursor = min(len(samples), comparison.end + _SLACK)
         result.append(comparison)
@@ -130,53 +130,53 @@ def assert_heard(heard: Recording | Samples, references: Sequence[Samples]) -> l
 
 def _compare_next(samples: Samples, wanted: Samples, start: int) -> Comparison:
     """Compare the sentence whose first sound is at `start`, after silence."""
-    exact = _exact(samples, wanted, start)
+    exact = _compare_exactly(samples, wanted, start)
     if exact:
         return exact
     first = max(0, start - _LOST)
     nearby = samples[first : start + len(wanted) + _SLACK].astype(np.float64)
     offset = first + _align(nearby, wanted, _LOST + _SLACK)
     inside = extent(samples[max(0, offset - _SLACK) : offset + len(wanted) + _SLACK])
-    return _at(samples, wanted, offset, (inside[1] - inside[0]) / RATE if inside else 0.0)
+    return _compare_at(samples, wanted, offset, (inside[1] - inside[0]) / RATE if inside else 0.0)
 
 
-def _exact(samples: Samples, wanted: Samples, start: int) -> Comparison | None:
+def _compare_exactly(samples: Samples, wanted: Samples, start: int) -> Comparison | None:
     """Compare the sound at `start` sample by sample. Return None if it isn't the complete sentence.
 
     If a player ran dry, zeros were inserted, and the monitor may have dropped some samples after them.
     """
-    runs = _walk(samples, wanted, start)
+    runs = _equal_runs(samples, wanted, start)
     if not runs or not _nearly_whole(runs, wanted):
         return None
     length = len(wanted) / RATE
-    return Comparison(1.0, 1.0, runs[0][0] - runs[0][1], length, length, _places(runs))
+    return Comparison(1.0, 1.0, runs[0][0] - runs[0][1], length, length, _indexes(runs))
 
 
-def _walk(samples: Samples, wanted: Samples, place: int, ahead: int = 0) -> list[tuple[int, int, int]]:
+def _equal_runs(samples: Samples, wanted: Samples, index: int, ahead: int = 0) -> list[tuple[int, int, int]]:
     """Return the runs of equal samples: their start in the recording, their start in the reference, and their length.
 
     Between two runs, the recording only has zeros, and at most the samples that the monitor may drop are missing. The
     first run may start up to `ahead` samples later in the reference.
     """
     runs: list[tuple[int, int, int]] = []
-    own = 0
+    ref = 0
     while True:
-        sound = place + _leading_zeros(samples[place:])
-        dry = sound - place >= _RUN or not runs
+        sound = index + _leading_zeros(samples[index:])
+        dry = sound - index >= _RUN or not runs
         lost = (_LOST if dry else _LOST_ONCE) + (0 if runs else ahead)
-        skipped = _find(samples[sound : sound + _RUN], wanted[own:], lost + sound - place)
-        if skipped is None or np.count_nonzero(wanted[own : own + skipped]) > lost:
+        skipped = _find(samples[sound : sound + _RUN], wanted[ref:], lost + sound - index)
+        if skipped is None or np.count_nonzero(wanted[ref : ref + skipped]) > lost:
             return runs
-        own += skipped
-        length = _same_length(samples[sound:], wanted[own:])
-        runs.append((sound, own, length))
-        place, own = sound + length, own + length
+        ref += skipped
+        length = _same_length(samples[sound:], wanted[ref:])
+        runs.append((sound, ref, length))
+        index, ref = sound + length, ref + length
 
 
 def _nearly_whole(runs: Sequence[tuple[int, int, int]], wanted: Samples) -> bool:
     """Return whether no more samples were dropped and inserted than on a busy machine."""
-    reached = [0, *(own + length for _, own, length in runs)]
-    starts = [*(own for _, own, _ in runs), len(wanted)]
+    reached = [0, *(ref + length for _, ref, length in runs)]
+    starts = [*(ref for _, ref, _ in runs), len(wanted)]
     lost = [int(np.count_nonzero(wanted[a:b])) for a, b in zip(reached, starts, strict=True)]
     longer = runs[-1][0] - runs[0][0] - (runs[-1][1] - runs[0][1])
     # Samples that are missing without inserted zeros: the monitor dropped them, although no player ran dry.
@@ -195,10 +195,10 @@ def _leading_zeros(samples: Samples) -> int:
 
 def _find(piece: Samples, wanted: Samples, last: int) -> int | None:
     """Return the first index, up to `last`, of the piece in `wanted`. The end of `wanted` may cut the piece off."""
-    for place in np.flatnonzero(wanted[: last + 1] == piece[0]) if len(piece) else ():
-        rest = wanted[place : place + len(piece)]
+    for index in np.flatnonzero(wanted[: last + 1] == piece[0]) if len(piece) else ():
+        rest = wanted[index : index + len(piece)]
         if np.array_equal(piece[: len(rest)], rest):
-            return int(place)
+            return int(index)
     return None
 
 
@@ -209,9 +209,9 @@ def _same_length(samples: Samples, wanted: Samples) -> int:
     return int(different[0]) if len(different) else length
 
 
-def _places(runs: Sequence[tuple[int, int, int]]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    heard, own = zip(*((np.arange(a, a + length), np.arange(b, b + length)) for a, b, length in runs), strict=True)
-    return np.concatenate(heard), np.concatenate(own)
+def _indexes(runs: Sequence[tuple[int, int, int]]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    heard, ref = zip(*((np.arange(a, a + length), np.arange(b, b + length)) for a, b, length in runs), strict=True)
+    return np.concatenate(heard), np.concatenate(ref)
 
 
 def assert_only_beginning(heard: Recording | Samples, reference: Samples, shortest: float = 0.1) -> float:
@@ -221,7 +221,7 @@ def assert_only_beginning(heard: Recording | Samples, reference: Samples, shorte
     assert found is not None, "nothing was heard"
     wanted = _sound(reference)
     sound = samples[found[0] : found[1]]
-    last = _walk(sound, wanted, 0)[-1:]  # the player may have run dry
+    last = _equal_runs(sound, wanted, 0)[-1:]  # the player may have run dry
     if last and last[0][0] + last[0][2] == len(sound):
         seconds = (last[0][1] + last[0][2]) / RATE
     else:
@@ -235,7 +235,7 @@ def assert_only_beginning(heard: Recording | Samples, reference: Samples, shorte
 def matching_length(samples: Samples, reference: Samples) -> int:
     """Return the index in the recording up to which it is equal to the reference, or 0 if it isn't from the start."""
     found = extent(samples)
-    last = _walk(samples, _sound(reference), found[0])[-1:] if found else []
+    last = _equal_runs(samples, _sound(reference), found[0])[-1:] if found else []
     return last[0][0] + last[0][2] if last else 0
 
 
@@ -260,7 +260,7 @@ def assert_resumed(heard: Recording | Samples, reference: Samples, pause: float,
     except AssertionError as error:
         # Zeros of the sentence next to the pause look like a part of the pause.
         if not _ran_dry(first, samples[end : loud[-1] + 1], wanted, round(repeated * RATE)):
-            runs = [_walk(part, wanted, 0, ahead=len(wanted)) for part in (first, second)]
+            runs = [_equal_runs(part, wanted, 0, ahead=len(wanted)) for part in (first, second)]
             parts = f"parts of {len(first)} and {len(second)} samples, equal samples (recording, reference, count)"
             raise AssertionError(f"{error}; {parts}: {runs[0]} and {runs[1]} of {len(wanted)}") from error
     return length
@@ -272,20 +272,20 @@ def find_part(part: Samples, wanted: Samples, reached: int, back: int) -> tuple[
     `reached` is the number of samples that were heard before. The part may repeat the last `back` of them.
     """
     start = max(0, reached - back)
-    runs = _walk(part, wanted[start:], 0, ahead=reached - start)
+    runs = _equal_runs(part, wanted[start:], 0, ahead=reached - start)
     if not runs or runs[-1][0] + runs[-1][2] < len(part):
         return None
     return start + runs[0][1], start + runs[-1][1] + runs[-1][2]
 
 
 def _ran_dry(first: Samples, second: Samples, wanted: Samples, repeated: int) -> bool:
-    """Return whether these are the two parts of a sentence in which a player ran dry (see `_exact`)."""
-    runs = _walk(first, wanted, 0)
+    """Return whether these are the two parts of a sentence in which a player ran dry (see `_compare_exactly`)."""
+    runs = _equal_runs(first, wanted, 0)
     if not runs or runs[-1][0] + runs[-1][2] < len(first):
         return False
     reached = runs[-1][1] + runs[-1][2]
     back = min(reached, repeated + _SLACK)
-    rest = _walk(second, wanted[reached - back :], 0, ahead=back)
+    rest = _equal_runs(second, wanted[reached - back :], 0, ahead=back)
     if not rest or len(wanted) - (reached - back + rest[-1][1] + rest[-1][2]) > _LOST:
         return False
     # A stream that continues drops nothing at the pause. A stream that was restarted or ran dry may drop samples.
@@ -296,7 +296,7 @@ def _ran_dry(first: Samples, second: Samples, wanted: Samples, repeated: int) ->
 def _assert_parts(first: Samples, second: Samples, wanted: Samples, repeated: float) -> None:
     assert max(len(first), len(second)) <= len(wanted), "more was heard than the sentence"
     # The monitor may have dropped the first samples.
-    lost = next((own for _, own, _ in _walk(first, wanted, 0)), 0)
+    lost = next((ref for _, ref, _ in _equal_runs(first, wanted, 0)), 0)
     reached = lost + len(first)
     assert_heard(first, [wanted[lost:reached]])
     assert_heard(second, [wanted[-len(second) :]])
@@ -310,11 +310,11 @@ def time_heard(recording: Recording, compared: Comparison, reference: Samples, p
     """Return the monotonic time at which a position of the reference (in seconds) was heard."""
     found = extent(reference)
     assert found is not None, "the reference is silence"
-    place = round(position * RATE) - found[0]
-    if compared.places is None:
-        return recording.time_of(compared.offset + place)
-    heard, own = compared.places
-    return recording.time_of(int(heard[min(int(np.searchsorted(own, place)), len(heard) - 1)]))
+    index = round(position * RATE) - found[0]
+    if compared.indexes is None:
+        return recording.time_of(compared.offset + index)
+    heard, ref = compared.indexes
+    return recording.time_of(int(heard[min(int(np.searchsorted(ref, index)), len(heard) - 1)]))
 
 
 def similarity(heard: Recording | Samples, reference: Samples) -> float:
@@ -335,11 +335,11 @@ def similarity(heard: Recording | Samples, reference: Samples) -> float:
     for start in range(0, len(wanted), length):
         part = wanted[start : start + length].astype(np.float64)
         around = _around(floats, offset + start, len(part), _NEARBY)
-        product, energy, _ = _best(around, part)
+        product, energy, _ = _best_match(around, part)
         dots += product
         energies += energy
-    own = wanted.astype(np.float64)
-    return dots / float(np.sqrt(float(own @ own) * max(energies, 1.0)))
+    ref = wanted.astype(np.float64)
+    return dots / float(np.sqrt(float(ref @ ref) * max(energies, 1.0)))
 
 
 def assert_silent(heard: Recording | Samples) -> None:
@@ -369,23 +369,23 @@ def _align(samples: Floats, wanted: Samples, last: int | None = None) -> int:
     return int(np.argmax(correlation[: (len(samples) if last is None else last) + 1]))
 
 
-def _at(samples: Samples, wanted: Samples, offset: int, heard: float) -> Comparison:
+def _compare_at(samples: Samples, wanted: Samples, offset: int, heard: float) -> Comparison:
     """Compare `wanted` with the samples at an offset, part by part. Each part may be slightly displaced."""
     reference = wanted.astype(np.float64)
     dots, energies, worst = 0.0, 0.0, 1.0
-    place = offset
+    index = offset
     for start in range(0, len(reference), _PART):
         part = reference[start : start + _PART]
-        around = _around(samples, place + start, len(part), _SLACK)
-        product, energy, best = _best(around, part)
+        around = _around(samples, index + start, len(part), _SLACK)
+        product, energy, best = _best_match(around, part)
         expected = float(part @ part)
         if product < SAME_PART * np.sqrt(expected * energy):
-            product, energy, best = _best_in_two(around, part)
+            product, energy, best = _best_match_in_two_parts(around, part)
         dots += product
         energies += energy
         if expected > len(part) * LOUD**2:
             worst = min(worst, product / float(np.sqrt(expected * max(energy, 1.0))))
-            place += min(0, best - _SLACK)  # after dropped samples, all later parts come earlier
+            index += min(0, best - _SLACK)  # after dropped samples, all later parts come earlier
     whole = float(np.sqrt(float(reference @ reference) * max(energies, 1.0)))
     return Comparison(dots / whole, worst, offset, heard, len(wanted) / RATE)
 
@@ -399,7 +399,7 @@ def _around(samples: Samples | Floats, offset: int, length: int, slack: int) -> 
     return padded
 
 
-def _best(around: Floats, part: Floats) -> tuple[float, float, int]:
+def _best_match(around: Floats, part: Floats) -> tuple[float, float, int]:
     """Return the product with a part at the best index, the energy of the samples there, and the index."""
     products = np.correlate(around, part, "valid")
     squares = np.concatenate([[0.0], np.cumsum(around**2)])
@@ -408,14 +408,16 @@ def _best(around: Floats, part: Floats) -> tuple[float, float, int]:
     return float(products[best]), float(energy[best]), best
 
 
-def _best_in_two(around: Floats, part: Floats) -> tuple[float, float, int]:
-    """Do the same as `_best` for a part in which the monitor may have dropped samples."""
+def _best_match_in_two_parts(around: Floats, part: Floats) -> tuple[float, float, int]:
+    """Do the same as `_best_match` for a part in which the monitor may have dropped samples."""
     results = []
     for cut in range(max(1, len(part) // 8), len(part), max(1, len(part) // 8)):
-        first = _best(around[: cut + 2 * _SLACK], part[:cut])
-        second = _best(around[cut:], part[cut:])
+        first = _best_match(around[: cut + 2 * _SLACK], part[:cut])
+        second = _best_match(around[cut:], part[cut:])
         results.append((first[0] + second[0], first[1] + second[1], second[2]))
-    return max(results or [_best(around, part)], key=lambda result: result[0] / float(np.sqrt(max(result[1], 1.0))))
+    return max(
+        results or [_best_match(around, part)], key=lambda result: result[0] / float(np.sqrt(max(result[1], 1.0)))
+    )
 
 
 def _describe(samples: Samples, comparisons: Sequence[Comparison]) -> str:

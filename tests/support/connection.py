@@ -42,11 +42,9 @@ class Wire(contextlib.AbstractContextManager["Wire"]):
         self.close()
 
     def send(self, message: Mapping[str, object]) -> None:
-        """Send an object as one line."""
         self.send_raw(json.dumps(message, ensure_ascii=False).encode() + b"\n")
 
     def send_raw(self, data: bytes) -> None:
-        """Send bytes as they are."""
         self._socket.settimeout(PATIENCE)
         self._socket.sendall(data)
 
@@ -102,5 +100,4 @@ class Wire(contextlib.AbstractContextManager["Wire"]):
         self._socket.shutdown(socket.SHUT_WR)
 
     def close(self) -> None:
-        """Close the connection."""
         self._socket.close()

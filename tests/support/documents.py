@@ -69,7 +69,6 @@ def tables(text: str) -> list[list[Row]]:
 
 
 def code_spans(cell: str) -> list[str]:
-    """Return the code spans in a cell."""
     return re.findall(r"`([^`]+)`", cell)
 
 

@@ -76,7 +76,6 @@ class Library:
         self._library.espeak_SetSynthCallback(self._callback)
 
     def speak(self, text: str, *, rate: int, volume: float = 1.0, voice: str = "en", pitch: int = 50) -> None:
-        """Render a text."""
         if self._library.espeak_SetVoiceByName(voice.encode()) != 0:
             sys.exit(f"libespeak-ng has no voice {voice!r}")
         self._library.espeak_SetParameter(_PARAMETER_RATE, rate, 0)
@@ -89,7 +88,6 @@ class Library:
 
 
 def main() -> None:
-    """Render the sentences from standard input."""
     samples = bytearray()
     words: list[Word] = []
 

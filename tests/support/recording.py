@@ -1,8 +1,8 @@
-"""The samples that a sink has played, and when each of them was heard.
+"""The samples that a sink has played, and the time at which each of them was heard.
 
-The thread that reads the sink's monitor fills a recording, and the test reads it. Times are of the monotonic clock, and
-good to one block of the monitor (10 ms). A block can only arrive late, so the earliest block after a sample tells its
-time.
+A thread reads the sink's monitor and fills the recording, and the test reads the recording. Times are monotonic, and
+as precise as one block of the monitor (10 ms). A block can be late, but never early, so the time of a sample is the
+earliest time that the blocks after it allow.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ if TYPE_CHECKING:
 
     Samples = npt.NDArray[np.int16]
 
-#: Louder samples are sound. The pauses of espeak-ng are below it, and the silence of a null sink is zero.
+#: Louder samples are sound. espeak-ng's pauses are quieter, and the silence of a null sink is zero.
 LOUD = 50
-#: Seconds of the blocks that may tell the time of a sample.
+#: Length of the blocks that determine the time of a sample.
 _WINDOW_S = 0.25
-#: Seconds within which a sink must be quiet.
+#: Time limit until a sink is quiet.
 _QUIET_WITHIN_S = 30
 
 
 class Recording:
-    """The samples of a sink's monitor since `Sink.record()`, also while it is running."""
+    """The samples of a sink's monitor since `Sink.record()`. It can be read while it grows."""
 
     def __init__(self, changed: threading.Condition) -> None:
         self._changed = changed
         self._blocks: list[Samples] = []
-        self._ends: list[int] = []  # number of samples up to the end of each block
-        self._times: list[float] = []  # arrival of each block
+        self._ends: list[int] = []  # total number of samples at the end of each block
+        self._times: list[float] = []  # time of arrival of each block
         self._first_loud: int | None = None
         self._last_loud: int | None = None
 
     def add(self, block: Samples, arrived: float) -> None:
-        """Add a block of the monitor. The caller holds the condition and notifies."""
+        """Add a block of the monitor. The caller must hold the condition and notify."""
         start = len(self)
         self._blocks.append(block)
         self._ends.append(start + len(block))
@@ -65,7 +65,7 @@ class Recording:
         return self.samples[self.sample_at(start) : self.sample_at(end)]
 
     def time_of(self, sample: int) -> float:
-        """Return the time at which a sample was heard. A negative sample is before the recording."""
+        """Return the time at which a sample was heard. Negative samples are before the recording."""
         with self._changed:
             first = bisect.bisect_right(self._ends, sample)
             if first == len(self._ends):
@@ -78,11 +78,11 @@ class Recording:
         return bisect.bisect_left(range(len(self)), moment, key=self.time_of)
 
     def first_sound(self) -> float | None:
-        """Return the time of the first sound, None if nothing was heard."""
+        """Return the time of the first sound, or None if nothing was heard."""
         return None if self._first_loud is None else self.time_of(self._first_loud)
 
     def last_sound(self) -> float | None:
-        """Return the time of the last sound so far, None if nothing was heard."""
+        """Return the time of the last sound so far, or None if nothing was heard."""
         return None if self._last_loud is None else self.time_of(self._last_loud)
 
     def wait_for_sound(self, timeout: float = 10) -> float:
@@ -94,21 +94,22 @@ class Recording:
             return self.time_of(start + int(_loud(np.concatenate(self._blocks)[start:])[0]))
 
     def wait_until_quiet(self, quiet: float = 0.5) -> float | None:
-        """Wait for so many seconds of silence after this call, and return the time of the last sound.
+        """Wait for `quiet` seconds of silence after this call, and return the time of the last sound.
 
-        The silence is counted in samples, so a suspended sink is never quiet: that raises TimeoutError.
+        Silence is counted in samples. A suspended sink sends no samples, so the call raises TimeoutError.
         """
         with self._changed:
             start = len(self)
             if not self._changed.wait_for(
                 lambda: len(self) - max(start, (self._last_loud or 0) + 1) >= quiet * RATE, _QUIET_WITHIN_S
             ):
-                came = f"{len(self) - start} samples"
-                raise TimeoutError(f"not quiet for {quiet} s within {_QUIET_WITHIN_S} s, in which {came} came")
+                raise TimeoutError(
+                    f"not quiet for {quiet} s within {_QUIET_WITHIN_S} s ({len(self) - start} samples came)"
+                )
             return self.last_sound()
 
     def wait_until(self, moment: float, timeout: float = 1) -> bool:
-        """Wait until the samples up to a time have arrived, and return False if they don't."""
+        """Wait until the samples up to a time have arrived, and return False on a timeout."""
         with self._changed:
             return self._changed.wait_for(lambda: bool(self._times) and self._times[-1] >= moment, timeout)
 

@@ -1,7 +1,8 @@
-"""Reference renderings: the sound of sentences by libespeak-ng itself, never by talk.
+"""Reference renderings of sentences, made by libespeak-ng without talk.
 
-libespeak-ng does not repeat itself within a process, but a fresh process makes the same samples each time. So a
-reference is the same texts, in the same order, with the same settings, in one fresh process.
+In one process, libespeak-ng renders the same sentence differently each time. But each new process makes the same
+samples for the same texts in the same order. So each reference is rendered in a new process, with the same texts and
+settings.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ _PROGRAM = os.path.join(os.path.dirname(os.path.abspath(__file__)), "espeak.py")
 
 @dataclass(frozen=True, slots=True)
 class Sentence:
-    """A text and how it is spoken; the defaults are talk's."""
+    """A text and its settings, which have talk's defaults."""
 
     text: str
     rate: int = 200  # words per minute
@@ -45,10 +46,10 @@ class Sentence:
 
 @dataclass(frozen=True, slots=True)
 class Rendering:
-    """The sound of a sentence, and the places of its words."""
+    """The sound of a sentence, and the times of its words."""
 
     samples: Samples
-    #: start and end of each word in the text, and its seconds into the samples; some neighbours are one word
+    #: start and end of each word in the text, and its time in seconds. libespeak-ng joins some neighbouring words
     words: tuple[tuple[int, int, float], ...]
 
 
@@ -61,45 +62,45 @@ def render(
     pitch: int = 50,
     timeout: float = 30,
 ) -> list[Samples]:
-    """Return the samples of each sentence (22,050 Hz), rendered in order in one fresh process.
+    """Return the samples of each sentence (22,050 Hz), rendered in order in one new process.
 
-    The settings are those of every sentence that is a plain string; a `Sentence` brings its own.
+    The settings apply to sentences that are plain strings.
     """
     plain = Sentence("", rate, volume, voice, pitch)
-    asked = [replace(plain, text=each) if isinstance(each, str) else each for each in sentences]
-    return [each.samples for each in render_with_words(asked, timeout=timeout)]
+    complete = [replace(plain, text=item) if isinstance(item, str) else item for item in sentences]
+    return [rendering.samples for rendering in render_with_words(complete, timeout=timeout)]
 
 
 def without_leading_zeros(samples: Samples) -> Samples:
-    """Return the first sentence of a server as it is played: from the first sample on that is not zero."""
+    """Return the samples from the first one that isn't zero, as talk plays the first sentence of a server."""
     return samples[np.argmax(samples != 0) :]
 
 
 def render_with_words(sentences: Sequence[str | Sentence], *, timeout: float = 30) -> list[Rendering]:
     """Return the rendering of each sentence, as `render` does, with its words."""
-    return list(_rendered(tuple(Sentence(each) if isinstance(each, str) else each for each in sentences), timeout))
+    return list(_rendered(tuple(Sentence(item) if isinstance(item, str) else item for item in sentences), timeout))
 
 
 @functools.cache
-def _rendered(asked: tuple[Sentence, ...], timeout: float) -> tuple[Rendering, ...]:
+def _rendered(sentences: tuple[Sentence, ...], timeout: float) -> tuple[Rendering, ...]:
     result: list[Rendering] = []
-    rest = run([_PROGRAM], json.dumps([asdict(each) for each in asked]), timeout)
-    for _ in asked:
+    rest = run([_PROGRAM], json.dumps([asdict(sentence) for sentence in sentences]), timeout)
+    for _ in sentences:
         line, _newline, rest = rest.partition(b"\n")
         head = json.loads(line)
         end = head["samples"] * 2
         samples = np.frombuffer(rest[:end], dtype="<i2").astype(np.int16)
-        samples.flags.writeable = False  # all tests share it
+        samples.flags.writeable = False  # all tests share the array
         result.append(Rendering(samples, tuple((start, stop, at) for start, stop, at in head["words"])))
         rest = rest[end:]
     return tuple(result)
 
 
-def run(program: Sequence[str], asked: str, timeout: float) -> bytes:
+def run(program: Sequence[str], request: str, timeout: float) -> bytes:
     """Run a Python program that renders sentences, and return its output."""
     env = clean_environment(tempfile.gettempdir())
     done = subprocess.run(
-        [sys.executable, *program], input=asked.encode(), capture_output=True, timeout=timeout, env=env, check=False
+        [sys.executable, *program], input=request.encode(), capture_output=True, timeout=timeout, env=env, check=False
     )
-    assert done.returncode == 0, f"no reference rendering: {done.stderr.decode(errors='replace').strip()}"
+    assert done.returncode == 0, f"no reference was rendered: {done.stderr.decode(errors='replace').strip()}"
     return done.stdout

@@ -1,6 +1,6 @@
-"""A relay before the socket of a PulseAudio that delays, cuts or changes the answers of the server.
+"""A relay in front of PulseAudio's socket that can delay, cut or change the server's replies.
 
-Nothing in it waits: `pump` forwards what has come, and no more than the test allows.
+It never waits. `pump` forwards the data that has come, up to the test's limits.
 """
 
 from __future__ import annotations
@@ -10,27 +10,27 @@ import select
 import socket
 import struct
 
-#: The header of a frame: length, channel, two halves of an offset, flags.
+#: Header of a frame: length, channel, high and low half of an offset, flags.
 _HEADER = struct.Struct(">5I")
-#: The channel of messages.
+#: Channel of control messages.
 _CONTROL = 0xFFFFFFFF
-#: A 32 bit number in a message, and the commands, which are the first number.
+#: A 32-bit number in a message, and commands. The first number of a message is its command.
 _NUMBER = struct.Struct(">cI")
 _ERROR, _REPLY = 0, 2
 
 
 class Relay(contextlib.AbstractContextManager["Relay"]):
-    """Listens at the socket `path`, and relays one client to the server at `server`."""
+    """Accepts one client at the socket `path`, and connects it with the server at `server`."""
 
     def __init__(self, path: str, server: str) -> None:
-        #: bytes that are forwarded at once
+        #: bytes that are forwarded in one step
         self.piece = 65536
-        #: bytes from the server after which the connection is cut, or becomes silent
+        #: number of bytes from the server after which the connection is cut, or becomes silent
         self.cut_at: int | None = None
         self.silent_at: int | None = None
-        #: the number, from 0, of the reply that becomes an error, and the code of the error
+        #: index of the reply that is replaced by an error, and the error's code
         self.error: tuple[int, int] | None = None
-        #: bytes from the server that were forwarded, and replies
+        #: number of bytes and replies from the server that were forwarded
         self.forwarded = self.replies = 0
         self._server = server
         self._listening = socket.socket(socket.AF_UNIX)
@@ -46,7 +46,7 @@ class Relay(contextlib.AbstractContextManager["Relay"]):
         self._hang_up()
 
     def pump(self) -> None:
-        """Forward data in both directions, as far as it is allowed."""
+        """Forward data in both directions, up to the limits."""
         if self._client is None:
             self._accept()
         if self._client is None or self._up is None:
@@ -56,7 +56,7 @@ class Relay(contextlib.AbstractContextManager["Relay"]):
             self._frames += _read(self._up)
             self._take_frames()
             _write(self._up, self._to_server, self.piece)
-            limits = [each - self.forwarded for each in (self.cut_at, self.silent_at) if each is not None]
+            limits = [limit - self.forwarded for limit in (self.cut_at, self.silent_at) if limit is not None]
             self.forwarded += _write(self._client, self._to_client, max(0, min([self.piece, *limits])))
         except ConnectionError:
             self._hang_up()
@@ -64,9 +64,9 @@ class Relay(contextlib.AbstractContextManager["Relay"]):
             self._hang_up()
 
     def register(self, poll: select.poll) -> None:
-        """Register the sockets on which data may come."""
-        for each in (self._listening,) if self._client is None or self._up is None else (self._up, self._client):
-            poll.register(each, select.POLLIN)
+        """Register the sockets that may become readable."""
+        for source in (self._listening,) if self._client is None or self._up is None else (self._up, self._client):
+            poll.register(source, select.POLLIN)
 
     @property
     def waiting(self) -> int:
@@ -81,7 +81,7 @@ class Relay(contextlib.AbstractContextManager["Relay"]):
             self._up.setblocking(False)
 
     def _take_frames(self) -> None:
-        """Take whole frames of the server, and change a reply into an error if the test asks for it."""
+        """Take complete frames from the server, and replace a reply by an error if the test wants this."""
         while len(self._frames) >= _HEADER.size:
             length, channel, *_ = _HEADER.unpack_from(self._frames)
             end = _HEADER.size + length
@@ -98,13 +98,13 @@ class Relay(contextlib.AbstractContextManager["Relay"]):
         number, self.replies = self.replies, self.replies + 1
         if self.error is None or number != self.error[0]:
             return frame
-        told = b"".join(_NUMBER.pack(b"L", each) for each in (_ERROR, tag, self.error[1]))
-        return _HEADER.pack(len(told), _CONTROL, 0, 0, 0) + told
+        message = b"".join(_NUMBER.pack(b"L", value) for value in (_ERROR, tag, self.error[1]))
+        return _HEADER.pack(len(message), _CONTROL, 0, 0, 0) + message
 
     def _hang_up(self) -> None:
-        for each in (self._client, self._up):
-            if each is not None:
-                each.close()
+        for connection in (self._client, self._up):
+            if connection is not None:
+                connection.close()
         self._up = None
         self._to_client.clear()
 
@@ -119,9 +119,9 @@ def _read(source: socket.socket) -> bytes:
     return data
 
 
-def _write(target: socket.socket, data: bytearray, most: int) -> int:
+def _write(target: socket.socket, data: bytearray, limit: int) -> int:
     sent = 0
     with contextlib.suppress(BlockingIOError):
-        sent = target.send(data[:most]) if data and most else 0
+        sent = target.send(data[:limit]) if data and limit else 0
         del data[:sent]
     return sent

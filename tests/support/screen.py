@@ -1,7 +1,7 @@
-"""A terminal for a test: it runs a program, draws what that writes, and tells what can be seen.
+"""A terminal emulator: it runs a program, draws its output, and returns the text on the screen.
 
-It draws wide characters, combining marks, wrapped lines, and the few control sequences that `talk` may use. All other
-control sequences are errors.
+It supports wide characters, combining marks, wrapped lines, and the few control sequences that `talk` may use. All
+other control sequences are errors.
 """
 
 from __future__ import annotations
@@ -32,39 +32,39 @@ _IN_A_TERMINAL = (
 
 
 class Screen:
-    """A drawing. A cell is a character and its attributes, and an empty cell follows a wide character."""
+    """The cells of a screen: characters with attributes. A wide character is followed by an empty cell."""
 
     def __init__(self, columns: int) -> None:
         self.columns = columns
         self.rows: list[list[tuple[str, str]]] = [[]]
-        #: the number of lines that were too long for a row
+        #: number of lines that were too long for a row
         self.wraps = 0
         self.column = 0
         self.attributes = ""
 
     def draw(self, text: str) -> None:
-        """Draw a text with whole control sequences."""
-        place = 0
-        while place < len(text):
-            if control := _CONTROL.match(text, place):
+        """Draw a text that may contain complete control sequences."""
+        index = 0
+        while index < len(text):
+            if control := _CONTROL.match(text, index):
                 self._control(control["letter"], control["numbers"])
-                place = control.end()
+                index = control.end()
             else:
-                self._character(text[place])
-                place += 1
+                self._character(text[index])
+                index += 1
 
     @property
     def lines(self) -> list[str]:
         """The rows as text, without trailing blanks."""
-        return ["".join(each for each, _ in row).rstrip() for row in self.rows]
+        return ["".join(character for character, _ in row).rstrip() for row in self.rows]
 
     @property
     def last(self) -> str:
         return self.lines[-1]
 
     def marked(self, attribute: str, row: int = -1) -> str:
-        """Return the characters of a row with an attribute: "7" is reversed, "2" is dim."""
-        return "".join(each for each, has in self.rows[row] if attribute in has.split(";"))
+        """Return the characters of a row with an attribute ("7": reversed, "2": dim)."""
+        return "".join(character for character, attributes in self.rows[row] if attribute in attributes.split(";"))
 
     def _character(self, character: str) -> None:
         row = self.rows[-1]
@@ -73,18 +73,18 @@ class Screen:
         elif character == "\n":
             self._next_row()
         elif unicodedata.category(character) in {"Mn", "Me"}:
-            place = max((each for each in range(min(self.column, len(row))) if row[each][0]), default=None)
-            if place is not None:
-                row[place] = (row[place][0] + character, row[place][1])
+            index = max((cell for cell in range(min(self.column, len(row))) if row[cell][0]), default=None)
+            if index is not None:
+                row[index] = (row[index][0] + character, row[index][1])
         else:
             assert character.isprintable(), f"{character!r} reached the terminal"
-            wide = 2 if unicodedata.east_asian_width(character) in "WF" else 1
-            if self.column + wide > self.columns:
+            width = 2 if unicodedata.east_asian_width(character) in "WF" else 1
+            if self.column + width > self.columns:
                 self.wraps += 1
                 row = self._next_row()
             row.extend([(" ", "")] * (self.column - len(row)))
-            row[self.column : self.column + wide] = [(character, self.attributes)] + [("", "")] * (wide - 1)
-            self.column += wide
+            row[self.column : self.column + width] = [(character, self.attributes)] + [("", "")] * (width - 1)
+            self.column += width
 
     def _next_row(self) -> list[tuple[str, str]]:
         self.rows.append([])
@@ -101,11 +101,11 @@ class Screen:
 
 
 class Terminal:
-    """A program whose input, output and error are a terminal."""
+    """A program whose standard input, output and error are a terminal."""
 
     def __init__(self, command: Sequence[str], env: Mapping[str, str], columns: int = 80) -> None:
         self._changed = threading.Condition()
-        self._ours, theirs = os.openpty()
+        self._master, terminal = os.openpty()
         self._resize(columns)
         self.raw = b""
         self.screen = Screen(columns)
@@ -113,22 +113,22 @@ class Terminal:
         self.process = subprocess.Popen(
             [sys.executable, "-S", "-c", _IN_A_TERMINAL, *command],
             env={"TERM": "xterm", **env},
-            stdin=theirs,
-            stdout=theirs,
-            stderr=theirs,
+            stdin=terminal,
+            stdout=terminal,
+            stderr=terminal,
         )
-        os.close(theirs)
+        os.close(terminal)
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
-    def wait_until(self, seen: Callable[[Screen], bool], timeout: float = PATIENCE) -> None:
-        """Wait until the screen looks like this."""
+    def wait_until(self, condition: Callable[[Screen], bool], timeout: float = PATIENCE) -> None:
+        """Wait until the condition is true for the screen."""
         end = time.monotonic() + timeout
         with self._changed:
-            while not seen(self.screen):
-                left = end - time.monotonic()
-                assert left > 0, f"this is shown: {self.screen.rows}; this was written: {self.raw!r}"
-                self._changed.wait(left)
+            while not condition(self.screen):
+                remaining = end - time.monotonic()
+                assert remaining > 0, f"the screen: {self.screen.rows}; the output: {self.raw!r}"
+                self._changed.wait(remaining)
 
     def resize(self, columns: int) -> None:
         with self._changed:
@@ -136,10 +136,10 @@ class Terminal:
         self._resize(columns)
 
     def type(self, keys: bytes) -> None:
-        os.write(self._ours, keys)
+        os.write(self._master, keys)
 
     def finish(self, timeout: float = 20) -> int:
-        """Wait until the program has ended and everything is drawn, and return the exit code."""
+        """Wait until the program has ended and all its output is drawn. Return the exit code."""
         try:
             code = self.process.wait(timeout)
         finally:
@@ -154,23 +154,23 @@ class Terminal:
             self.process.wait()
         self._reader.join(PATIENCE)
         with contextlib.suppress(OSError):
-            os.close(self._ours)
+            os.close(self._master)
 
     def _resize(self, columns: int) -> None:
-        fcntl.ioctl(self._ours, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+        fcntl.ioctl(self._master, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
 
     def _read(self) -> None:
         rest = b""
-        with contextlib.suppress(OSError):  # nobody has the other end any more
+        with contextlib.suppress(OSError):  # no process has the terminal open any more
             while True:
-                data = os.read(self._ours, 65536)
+                data = os.read(self._master, 65536)
                 with self._changed:
                     self.raw += data
                     rest = self._draw(rest + data)
                     self._changed.notify_all()
 
     def _draw(self, data: bytes) -> bytes:
-        """Draw whole characters and control sequences, and return the rest."""
+        """Draw complete characters and control sequences, and return the rest."""
         end = len(data)
         escape = data.rfind(b"\x1b")
         if escape >= 0 and not _CONTROL.match(data[escape:].decode(errors="ignore")):

@@ -1,6 +1,6 @@
-"""A server of one client that follows a script, for what only a slow or a broken server does.
+"""A server for one client that follows a script, to test clients with slow and broken servers.
 
-A script is a function with the server's end of the connection, which has greeted already.
+A script is a function that gets the server's end of the connection, after the greeting.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ OVERVIEW: dict[str, Any] = {"server": {"pid": 1}, "active": None}
 
 
 def goal(state: str = "SUCCEEDED", goal_id: str = "g") -> dict[str, Any]:
-    """Return a goal as it goes over the wire."""
+    """Return a goal as the protocol represents it."""
     return Goal(goal_id, State[state], "a b c").to_json()
 
 
 def result(state: str = "SUCCEEDED") -> dict[str, Any]:
-    """Return the result event of `g`."""
+    """Return the result event of the goal `g`."""
     return {"event": "result", "goal": goal(state)}
 
 
@@ -43,23 +43,23 @@ class Peer:
         self._socket.settimeout(PATIENCE)
         self._file = connected.makefile("rb")
         self._events = itertools.count(1)
-        #: bytes of the longest request
+        #: size of the longest request in bytes
         self.longest = 0
 
     def receive(self, kind: str | None = None) -> dict[str, Any]:
         """Return the next request, which must be of this kind."""
         line = self._file.readline()
-        assert line, f"the client hung up instead of a {kind}"
+        assert line, f"the client closed the connection instead of sending {kind}"
         self.longest = max(self.longest, len(line))
         request: dict[str, Any] = json.loads(line)
         assert kind is None or request["request"] == kind, request
         return request
 
     def send(self, *messages: dict[str, Any]) -> None:
-        self._socket.sendall(b"".join(json.dumps(each).encode() + b"\n" for each in messages))
+        self._socket.sendall(b"".join(json.dumps(message).encode() + b"\n" for message in messages))
 
     def accept(self, *, state: str = "PENDING") -> None:
-        """Accept the next goal, as `g`."""
+        """Accept the next goal with the id `g`."""
         self.reply("say", goal=goal(state))
 
     def reply(self, kind: str, **fields: object) -> None:
@@ -80,7 +80,7 @@ class Peer:
 
 @contextlib.contextmanager
 def serving(play: Callable[[Peer], None]) -> Iterator[str]:
-    """Serve one client by a script, and give the path of the socket. At the end, raise what the script has raised."""
+    """Serve one client by a script, and yield the path of the socket. At the end, raise the script's exception."""
     failures: list[BaseException] = []
 
     def serve() -> None:
@@ -94,7 +94,7 @@ def serving(play: Callable[[Peer], None]) -> Iterator[str]:
                 with contextlib.suppress(OSError):
                     while connected.recv(65536):
                         pass
-        except BaseException as error:  # noqa: BLE001 - raised in the thread of the test
+        except BaseException as error:  # noqa: BLE001 - raised in the test's thread
             failures.append(error)
 
     with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:

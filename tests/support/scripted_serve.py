@@ -1,4 +1,4 @@
-"""Run `talk serve` with the scripted engine, with the arguments of `serve`."""
+"""Run `talk serve` with the scripted engine. The arguments are those of `serve`."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ _CODE = f"import sys; sys.path.insert(0, {_ROOT!r}); from tests.support.scripted
 
 
 def engine_command() -> list[str]:
-    """Return the command of the scripted engine, without a search for installed packages."""
+    """Return the command of the scripted engine. It doesn't search for installed packages, to start faster."""
     return [sys.executable, "-S", "-c", _CODE]
 
 
 def replace_engine() -> None:
-    """Have this process start the scripted engine."""
+    """Make this process start the scripted engine."""
     process.engine_command = engine_command
 
 

@@ -1,7 +1,7 @@
-"""A private sound server with one null sink, which plays in real time and records the sound.
+"""A private sound server with one null sink, which plays in real time and is recorded.
 
-The sink runs at espeak-ng's own 22,050 Hz, one channel, 16 bit, so the recording is the same sample for sample. Home,
-runtime directory and socket are in a directory of its own, so the user's sound server is neither seen nor touched.
+The sink has espeak-ng's format (22,050 Hz, one channel, 16 bit), so the samples aren't changed. Its home, runtime
+directory and socket are in a private directory, so the user's sound server isn't used.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ PROGRAMS = ("pulseaudio", "pactl", "parec", "pacat", "aplay")
 _NAME = "null"
 _NULL_SINK = ["module-null-sink", f"sink_name={_NAME}", f"rate={RATE}", "channels=1", "format=s16le"]
 _RAW = ["--raw", "--format=s16le", f"--rate={RATE}", "--channels=1"]
-#: The first sound of a cold null sink comes 1 to 2 s late; all of a warm-up may take this many seconds.
+#: Time limit of a warm-up, in seconds. The first sound of a new null sink is 1 to 2 s late.
 _WARM_UP = 20.0
-#: Seconds of steady blocks, with sound in them, after which a sink is warm; and the longest time between such blocks.
+#: A sink is warm after it has sent blocks for this time (in seconds) without longer gaps.
 _STEADY, _STEADY_GAP = 0.5, 0.08
-_START = 10.0
-#: Milliseconds that a distant sink is away.
+_LIMIT_S = 10.0
+#: Delay of a distant sink in milliseconds.
 LATENCY = 200
 
 
-def pactl(env: Mapping[str, str], *words: str) -> str:
+def pactl(env: Mapping[str, str], *arguments: str) -> str:
     """Run pactl in an environment and return its output."""
-    done = subprocess.run(["pactl", *words], env=env, capture_output=True, text=True, timeout=_START, check=False)
+    done = subprocess.run(["pactl", *arguments], env=env, capture_output=True, text=True, timeout=_LIMIT_S, check=False)
     if done.returncode != 0:
-        raise AssertionError(f"pactl {' '.join(words)}: {done.stderr.strip()}")
+        raise AssertionError(f"pactl {' '.join(arguments)}: {done.stderr.strip()}")
     return done.stdout
 
 
@@ -58,14 +58,14 @@ def _environment(directory: str) -> dict[str, str]:
 
 
 def _start_pulseaudio(directory: str, env: Mapping[str, str], *modules: str) -> subprocess.Popen[bytes]:
-    """Start a PulseAudio that listens in a directory, and wait until it does."""
+    """Start PulseAudio with its socket in a directory, and wait until it listens."""
     path = f"{directory}/pulse.sock"
     with contextlib.suppress(FileNotFoundError):
         os.unlink(path)
     options = ["-n", "--daemonize=no", "--exit-idle-time=-1", "--use-pid-file=no", "--disable-shm=yes"]
     options += ["--log-target=stderr", "--log-level=warn"]
-    for each in (*modules, f"module-native-protocol-unix auth-anonymous=1 auth-cookie-enabled=0 socket={path}"):
-        options += ["-L", each]
+    for module in (*modules, f"module-native-protocol-unix auth-anonymous=1 auth-cookie-enabled=0 socket={path}"):
+        options += ["-L", module]
     with open(f"{directory}/log", "ab") as log:
         server = subprocess.Popen(
             dying_with_parent(["pulseaudio", *options]),
@@ -74,7 +74,7 @@ def _start_pulseaudio(directory: str, env: Mapping[str, str], *modules: str) -> 
             stdout=log,
             stderr=log,
         )
-    end = time.monotonic() + _START
+    end = time.monotonic() + _LIMIT_S
     while True:
         with socket.socket(socket.AF_UNIX) as probe, contextlib.suppress(OSError):
             probe.connect(path)
@@ -84,11 +84,11 @@ def _start_pulseaudio(directory: str, env: Mapping[str, str], *modules: str) -> 
             server.wait()
             with open(f"{directory}/log", encoding="utf-8", errors="replace") as log:
                 raise AssertionError(f"pulseaudio does not start: {log.read()}")
-        time.sleep(0.01)  # a socket's appearance is no event
+        time.sleep(0.01)  # a new socket sends no event
 
 
 class Sink(contextlib.AbstractContextManager["Sink"]):
-    """A running sound server; `close()` or `with` ends all its processes and removes its directory."""
+    """A running sound server. `close()` and `with` end all its processes and remove its directory."""
 
     def __init__(self) -> None:
         needs(*PROGRAMS)
@@ -100,9 +100,9 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
         with contextlib.ExitStack() as stack:
             self.directory = stack.enter_context(short_directory("sink-"))
             self.socket = f"{self.directory}/pulse.sock"
-            where = f'type pulse server "unix:{self.socket}"'
+            server = f'type pulse server "unix:{self.socket}"'
             settings = {
-                ".asoundrc": f"pcm.!default {{ {where} }}\nctl.!default {{ {where} }}\n",
+                ".asoundrc": f"pcm.!default {{ {server} }}\nctl.!default {{ {server} }}\n",
                 "client.conf": "autospawn = no\nenable-shm = no\n",
             }
             for name, text in settings.items():
@@ -116,12 +116,12 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
         self.close()
 
     def close(self) -> None:
-        """End the sound server and remove its directory; closing twice is no error."""
+        """End the sound server and remove its directory. Closing twice is allowed."""
         self._stack.close()
 
     @property
     def env(self) -> dict[str, str]:
-        """The variables with which a child's aplay and pacat play into this sink."""
+        """The variables that make aplay and pacat play to this sink."""
         return {
             **_environment(self.directory),
             "PULSE_CLIENTCONFIG": f"{self.directory}/client.conf",
@@ -130,12 +130,11 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
 
     @property
     def pid(self) -> int:
-        """Process id of the sound server."""
         return self._running().pid
 
     @contextlib.contextmanager
     def record(self) -> Iterator[Recording]:
-        """Record the sound from now to the end of the block, including the very last block played."""
+        """Record the sound until the end of the `with` block, including the last block of the sink."""
         recording = Recording(self._changed)
         with self._changed:
             self._taps.append(recording)
@@ -148,73 +147,70 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
                 self._taps.remove(recording)
 
     def play(self, samples: npt.NDArray[np.int16]) -> None:
-        """Play samples to their end."""
         command = ["aplay", "-q", "-t", "raw", "-f", "S16_LE", "-r", str(RATE), "-c", "1", "-"]
-        subprocess.run(command, env=self._child(), input=samples.tobytes(), check=True, timeout=60)
+        subprocess.run(command, env=self._child_env(), input=samples.tobytes(), check=True, timeout=60)
 
     def suspend(self) -> None:
-        """Suspend the sink: it takes no more data from players, and nothing is heard."""
+        """Suspend the sink. It accepts no data from players, and nothing is heard."""
         self.pactl("suspend-sink", _NAME, "1")
 
     def resume(self) -> None:
-        """Let a suspended sink go on."""
         self.pactl("suspend-sink", _NAME, "0")
 
     def unload(self) -> None:
-        """Take the sink away, as if a device were unplugged: its streams are killed, there is no other sink."""
+        """Remove the sink as if a device were unplugged. Its streams are killed, and there is no other sink."""
         self.pactl("unload-module", self._module)
         self._module = ""
         self._end_monitor()
 
     def reload(self, *, warm: bool = True) -> None:
-        """Bring the sink back after `unload()`; a running recording goes on with it.
+        """Load the sink again after `unload()`. Recordings continue.
 
-        The first sound of a sink that is not `warm` comes 1 to 2 s late, as on a robot.
+        If it isn't `warm`, its first sound is 1 to 2 s late, as on a robot.
         """
         self._module = self.pactl("load-module", *_NULL_SINK).strip()
-        self._monitor = _Monitor(self._child(), self._taps, self._changed)
+        self._monitor = _Monitor(self._child_env(), self._taps, self._changed)
         if warm:
             self._warm_up()
 
     def freeze(self) -> None:
-        """Stop the sound server (SIGSTOP); all its threads have stopped when this returns."""
+        """Stop the sound server (SIGSTOP), and wait until all its threads have stopped."""
         stop_child(self.pid)
 
     def thaw(self) -> None:
-        """Let a frozen sound server go on (SIGCONT)."""
+        """Continue the sound server (SIGCONT)."""
         self._running().send_signal(signal.SIGCONT)
 
     def kill_server(self) -> None:
-        """Kill the sound server, as if it had crashed."""
+        """Kill the sound server as if it had crashed."""
         self._running()
         self._end()
 
     def start_server(self, *, warm: bool = True) -> None:
-        """Start the sound server and its sink, as `reload()` does; again after `kill_server()`."""
+        """Start the sound server and its sink, also after `kill_server()`. See `reload()` for `warm`."""
         self._server = _start_pulseaudio(self.directory, self.env)
         self.reload(warm=warm)
 
-    def pactl(self, *words: str) -> str:
-        """Run pactl and return its output."""
-        return pactl(self._child(), *words)
+    def pactl(self, *arguments: str) -> str:
+        return pactl(self._child_env(), *arguments)
 
     def _running(self) -> subprocess.Popen[bytes]:
         if self._server is None:
-            raise RuntimeError("the sound server was killed, and not started again")
+            raise RuntimeError("the sound server was killed and not restarted")
         return self._server
 
-    def _child(self) -> dict[str, str]:
+    def _child_env(self) -> dict[str, str]:
         return clean_environment(self.directory, self.env)
 
     def _warm_up(self) -> None:
-        """Play a tone until it is heard and blocks come in small and steadily; then wait until it is over."""
+        """Play a tone until it is heard and the monitor sends small blocks steadily. Then wait for silence."""
         tone = f"{self.directory}/tone"
         wave = 3000 * np.sin(np.arange(int(_WARM_UP * RATE)) * (2 * np.pi * 441 / RATE))
         with open(tone, "wb") as file:
             file.write(wave.astype("<i2").tobytes())
         command = dying_with_parent(["pacat", *_RAW, "--latency-msec=30", tone])
         with self.record() as recording:
-            player = subprocess.Popen(command, env=self._child(), stderr=subprocess.DEVNULL)
+            player = subprocess.Popen(command, env=self._child_env(), stderr=subprocess.DEVNULL)
             try:
                 recording.wait_for_sound(_WARM_UP)
                 with self._changed:
@@ -241,9 +237,9 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
 
 
 class _Monitor:
-    """A `parec` at the sink's monitor and the thread that reads it into the recordings, as long as the sink exists.
+    """A `parec` at the sink's monitor, and a thread that adds its samples to the recordings until the sink is removed.
 
-    A null sink renders in blocks of two seconds unless a client records with low latency, so this one stays attached.
+    It runs all the time: a null sink renders blocks of two seconds unless a client records with a low latency.
     """
 
     def __init__(self, env: dict[str, str], taps: list[Recording], changed: threading.Condition) -> None:
@@ -263,15 +259,15 @@ class _Monitor:
         self._thread.start()
 
     def steady_for(self) -> float:
-        """Return for how many seconds, up to the last block, blocks have arrived without a gap."""
+        """Return the seconds, up to the last block, in which blocks have arrived without a gap."""
         return self._last - self._steady_since if self._last else 0.0
 
     def running(self) -> bool:
-        """Return whether it still reads; it ends with its sink."""
+        """Return whether the thread still runs. It ends with the sink."""
         return self._thread.is_alive()
 
     def close(self) -> None:
-        """End the reader; the recordings keep the sound."""
+        """End the thread. The recordings keep their samples."""
         self._parec.kill()
         self._parec.wait()
         self._thread.join()
@@ -280,12 +276,12 @@ class _Monitor:
 
     def _read(self) -> None:
         assert self._parec.stdout
-        odd = b""
+        rest = b""
         while data := os.read(self._parec.stdout.fileno(), 65536):
             arrived = time.monotonic()
-            data = odd + data
+            data = rest + data
             even = len(data) // 2 * 2
-            block, odd = np.frombuffer(data[:even], dtype="<i2").astype(np.int16), data[even:]
+            block, rest = np.frombuffer(data[:even], dtype="<i2").astype(np.int16), data[even:]
             with self._changed:
                 if arrived - self._last > _STEADY_GAP:
                     self._steady_since = arrived
@@ -296,7 +292,7 @@ class _Monitor:
 
 
 class DistantSink(contextlib.AbstractContextManager["DistantSink"]):
-    """A second PulseAudio, 200 ms away from a sink, as loudspeakers by Bluetooth are: a tunnel to it."""
+    """A second PulseAudio with a tunnel to a sink, which delays the sound by 200 ms, like Bluetooth loudspeakers."""
 
     def __init__(self, sink: Sink) -> None:
         with contextlib.ExitStack() as stack:

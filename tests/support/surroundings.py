@@ -1,4 +1,4 @@
-"""The surroundings of the programs that tests start: short private directories, clean environments, no leftovers."""
+"""Requirements of tests, and private directories, clean environments and leftover checks for their programs."""
 
 from __future__ import annotations
 
@@ -23,48 +23,48 @@ from talkcli import paths
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-#: The longest path of a temporary directory in bytes that leaves room for a Unix socket's, which has at most 107.
-_LONGEST_TEMPORARY = 50
-#: The variable that marks a test's processes, so that leftovers are found whichever process is their parent now.
+#: Length limit for the temporary directory, because the path of a Unix socket can have at most 107 bytes.
+_TEMPORARY_PATH_BYTES = 50
+#: The environment variable that marks a test's processes, so that leftovers are found even without their parent.
 MARK = "TALK_TEST_ID"
-#: The variables that a child inherits; the user's audio, runtime directory and settings stay out.
-_KEPT = ("PATH", "TMPDIR", "SYSTEMROOT", "LD_LIBRARY_PATH", "COVERAGE_PROCESS_START")
-#: Directories of programs that serve a whole machine.
-_SYSTEM = "/usr/local/sbin:/usr/sbin:/sbin"
-#: Seconds in which a killed process must be gone.
+#: The variables that children inherit. The user's audio, runtime directory and settings aren't inherited.
+_INHERITED = ("PATH", "TMPDIR", "SYSTEMROOT", "LD_LIBRARY_PATH", "COVERAGE_PROCESS_START")
+#: Directories of system programs.
+_SYSTEM_PATH = "/usr/local/sbin:/usr/sbin:/sbin"
+#: Time limit until a killed process has disappeared.
 _KILL_LIMIT = 2.0
 
 
 def needs(*programs: str) -> None:
-    """Skip the test if a program is missing; in CI, where nothing may be skipped, fail it."""
-    _skip_without([each for each in programs if find_program(each) is None])
+    """Skip the test if a program is missing. In CI, fail it."""
+    _skip_without([name for name in programs if find_program(name) is None])
 
 
 def find_program(name: str) -> str | None:
-    """Return the path of a program, also if a user's PATH lacks its directory, as for Debian's mosquitto."""
-    return shutil.which(name) or shutil.which(name, path=_SYSTEM)
+    """Return the path of a program. Also search system directories, where Debian installs mosquitto."""
+    return shutil.which(name) or shutil.which(name, path=_SYSTEM_PATH)
 
 
 def needs_packages(*names: str) -> None:
-    """Skip the test if a Python package is missing, by its name for `import`; in CI, fail it."""
-    _skip_without([each for each in names if find_spec(each) is None])
+    """Skip the test if a Python package (by its name for `import`) is missing. In CI, fail it."""
+    _skip_without([name for name in names if find_spec(name) is None])
 
 
 def needs_no_server() -> None:
-    """Skip the test if there is or was a server at a place where clients look; in CI, fail it.
+    """Skip the test if clients would find a server or its old socket on this machine. In CI, fail it.
 
-    A client that names no socket would have that server say the texts of the test aloud.
+    Otherwise, clients without a socket option would make that server speak the texts of the test aloud.
     """
-    for place in [*paths.client_sockets(None), *glob.glob(f"/run/user/*/talk/{paths.SOCKET_NAME}")]:
+    for path in [*paths.client_sockets(None), *glob.glob(f"/run/user/*/talk/{paths.SOCKET_NAME}")]:
         with socket.socket(socket.AF_UNIX) as probe:
             probe.settimeout(1)
             try:
-                probe.connect(place)
-                found = "there is one"
+                probe.connect(path)
+                state = "a server runs"
             except OSError as error:
-                found = paths.describe_place(place, error)
-        if found != paths.PLACE_ABSENT:
-            _skip(f"needs a machine on which no talk server runs; {place}: {found}")
+                state = paths.describe_place(path, error)
+        if state != paths.PLACE_ABSENT:
+            _skip(f"needs a machine on which no talk server runs; {path}: {state}")
 
 
 def _skip_without(missing: list[str]) -> None:
@@ -80,9 +80,9 @@ def _skip(reason: str) -> NoReturn:
 
 @contextlib.contextmanager
 def short_directory(prefix: str = "talk-") -> Iterator[str]:
-    """Give a private directory with a path short enough for sockets, removed at the end."""
+    """Yield a private directory with a path short enough for sockets, and remove it at the end."""
     base = tempfile.gettempdir()
-    if len(os.fsencode(base)) > _LONGEST_TEMPORARY:
+    if len(os.fsencode(base)) > _TEMPORARY_PATH_BYTES:
         base = "/tmp"
     path = os.path.realpath(tempfile.mkdtemp(prefix=prefix, dir=base))
     try:
@@ -92,8 +92,8 @@ def short_directory(prefix: str = "talk-") -> Iterator[str]:
 
 
 def clean_environment(home: str, extra: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Return an environment for a child: its home, UTF-8, this checkout's talkcli, no user's sound server, `extra`."""
-    result = {name: os.environ[name] for name in _KEPT if name in os.environ}
+    """Return an environment for a child, with UTF-8 and this checkout's talkcli, but not the user's sound server."""
+    result = {name: os.environ[name] for name in _INHERITED if name in os.environ}
     result |= {
         "HOME": home,
         "LANG": "C.UTF-8",
@@ -108,7 +108,7 @@ def clean_environment(home: str, extra: Mapping[str, str] | None = None) -> dict
 
 
 def dying_with_parent(command: list[str]) -> list[str]:
-    """Return the command so that it is killed with the thread that starts it, as a killed test leaves nothing."""
+    """Return the command changed so that the process is killed when the thread that started it ends."""
     if sys.platform != "linux":
         return command
     needs("setpriv")
@@ -116,29 +116,29 @@ def dying_with_parent(command: list[str]) -> list[str]:
 
 
 def stop_child(pid: int) -> None:
-    """Stop a child of this process (SIGSTOP); it has stopped or ended when this returns."""
+    """Stop a child of this process (SIGSTOP), and wait until it has stopped or ended."""
     os.kill(pid, signal.SIGSTOP)
     os.waitid(os.P_PID, pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
 
 
 def find_marked(mark: str) -> list[int]:
-    """Return the ids of the living processes whose environment has this mark (none without /proc)."""
-    wanted = f"{MARK}={mark}".encode()
-    found = []
+    """Return the ids of the running processes with this mark (none without /proc)."""
+    variable = f"{MARK}={mark}".encode()
+    pids = []
     for name in os.listdir("/proc") if os.path.isdir("/proc") else []:
         if not name.isdigit():
             continue
         try:
             with open(f"/proc/{name}/environ", "rb") as environ:
-                if wanted in environ.read().split(b"\0"):
-                    found.append(int(name))
-        except OSError:  # ended meanwhile, or another user's
+                if variable in environ.read().split(b"\0"):
+                    pids.append(int(name))
+        except OSError:  # has ended, or belongs to another user
             continue
-    return found
+    return pids
 
 
 def command_line(pid: int) -> str:
-    """Return the command line of a process, for messages."""
+    """Return the command line of a process for messages."""
     try:
         with open(f"/proc/{pid}/cmdline", "rb") as file:
             return file.read().replace(b"\0", b" ").decode(errors="replace").strip()
@@ -147,20 +147,21 @@ def command_line(pid: int) -> str:
 
 
 def assert_none_left(mark: str, within: float) -> None:
-    """Assert that all processes with this mark end within some seconds; the others are killed."""
-    left = _left(mark, within)
-    if not left:
+    """Assert that all processes with this mark end within `within` seconds. Kill those that don't."""
+    remaining = _wait_for_end(mark, within)
+    if not remaining:
         return
-    lines = [f"{pid}: {command_line(pid)}" for pid in left]
-    for pid in left:
+    lines = [f"{pid}: {command_line(pid)}" for pid in remaining]
+    for pid in remaining:
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
-    lines += [f"{pid}: cannot be killed" for pid in _left(mark, _KILL_LIMIT)]
-    raise AssertionError("left running:\n" + "\n".join(lines))
+    lines += [f"{pid}: cannot be killed" for pid in _wait_for_end(mark, _KILL_LIMIT)]
+    raise AssertionError("still running:\n" + "\n".join(lines))
 
 
-def _left(mark: str, within: float) -> list[int]:
+def _wait_for_end(mark: str, within: float) -> list[int]:
+    """Return the processes that have not ended in time."""
     end = time.monotonic() + within
-    while (left := find_marked(mark)) and time.monotonic() < end:
-        time.sleep(0.01)  # only a child's end is an event
-    return left
+    while (remaining := find_marked(mark)) and time.monotonic() < end:
+        time.sleep(0.01)  # only children report their end
+    return remaining

@@ -1,4 +1,4 @@
-"""A program in a terminal, read as lines, for output from top to bottom and for shells, which draw."""
+"""A program in a terminal whose output is read as text. Use it for plain output and for shells."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from tests.support.connection import PATIENCE
 if TYPE_CHECKING:
     from types import TracebackType
 
-_COLOURING = re.compile("\x1b\\[[0-9;]*m")
+_COLOUR = re.compile("\x1b\\[[0-9;]*m")
 
 
 class Terminal(screen.Terminal):
-    """A `screen.Terminal` whose output is read as text; output that can't be drawn is no error before `finish`."""
+    """A `screen.Terminal` whose output is read as text. Output that can't be drawn is only an error in `finish`."""
 
     def __enter__(self) -> Terminal:
         return self
@@ -29,21 +29,21 @@ class Terminal(screen.Terminal):
     @property
     def text(self) -> str:
         """The output so far, without colours."""
-        return _COLOURING.sub("", self.raw.decode(errors="ignore")).replace("\r\n", "\n")
+        return _COLOUR.sub("", self.raw.decode(errors="ignore")).replace("\r\n", "\n")
 
     @property
     def lines(self) -> list[str]:
-        """The lines that were written, however the terminal has wrapped them."""
+        """The lines as they were written, without the terminal's wrapping."""
         return self.text.split("\n")[:-1]
 
     def wait_for(self, pattern: str, timeout: float = PATIENCE) -> re.Match[str]:
-        """Wait until the output has this pattern."""
+        """Wait until the output contains this pattern."""
         end = time.monotonic() + timeout
         with self._changed:
             while True:
-                found = re.search(pattern, self.text)
-                if found:
-                    return found
-                left = end - time.monotonic()
-                assert left > 0, f"{pattern!r} was not shown within {timeout} s, but {self.raw!r}"
-                self._changed.wait(left)
+                match = re.search(pattern, self.text)
+                if match:
+                    return match
+                remaining = end - time.monotonic()
+                assert remaining > 0, f"{pattern!r} was not shown within {timeout} s, but {self.raw!r}"
+                self._changed.wait(remaining)

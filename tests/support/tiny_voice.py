@@ -1,8 +1,7 @@
-"""A Piper voice of a few hundred bytes: a model (VITS, in ONNX) that hums where a voice would speak, and its JSON.
+"""A Piper voice of a few hundred bytes: a VITS model in ONNX that hums instead of speaking, and its JSON config.
 
-It has what is relied upon in a real one, the names and the shapes, and is loaded in some milliseconds. What else a
-model may be, broken, hostile or another's, it can be, too. It is written here without the `onnx` package, by the field
-numbers of `onnx.proto`.
+It has the names and shapes that talk needs, and is loaded in a few milliseconds. Tests can also make broken and hostile
+models. This module encodes them with the field numbers of `onnx.proto`, so it doesn't need the `onnx` package.
 """
 
 from __future__ import annotations
@@ -16,9 +15,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 FLOAT, INT64 = 1, 7
-#: The sounds that it knows: one number each, from 3 on; the first three are what each of Piper's voices has.
+#: The voice's phonemes. The index of each is its id. All Piper voices have the first three.
 SOUNDS = "_^$ !'(),-.:;?abcdefhijklmnopqrstuvwxyzæçðøħŋœɐɑɒɔəɚɛɜɡɪɹɾʃʊʌʒʔˈˌːθβχ\u0303\u0329ᵻ"
-#: Frames that each sound lasts, and those of the blank between two, at the voice's own pace.
+#: Frames of each phoneme, and of the blank between phonemes, at the voice's normal rate.
 SOUND_FRAMES, BLANK_FRAMES = 6.5, 0.5
 
 
@@ -38,24 +37,24 @@ def field(number: int, value: bytes | str | int) -> bytes:
 
 
 def node(operator: str, inputs: Sequence[str], output: str, *attributes: bytes, domain: str = "") -> bytes:
-    parts = [*(field(1, each) for each in inputs), field(2, output), field(4, operator)]
-    parts += [field(5, each) for each in attributes]
+    parts = [*(field(1, name) for name in inputs), field(2, output), field(4, operator)]
+    parts += [field(5, attribute) for attribute in attributes]
     return field(1, b"".join(parts) + (field(7, domain) if domain else b""))
 
 
 def number(name: str, value: int) -> bytes:
-    """Return an attribute that is an integer."""
+    """Return an integer attribute."""
     return field(1, name) + field(3, value) + field(20, 2)
 
 
 def numbers(name: str, *values: int) -> bytes:
-    """Return an attribute that is a list of integers."""
-    return field(1, name) + b"".join(field(8, each) for each in values) + field(20, 7)
+    """Return an attribute with a list of integers."""
+    return field(1, name) + b"".join(field(8, value) for value in values) + field(20, 7)
 
 
 def tensor(name: str, values: Sequence[float], *shape: int, kind: int = FLOAT, more: bytes = b"") -> bytes:
     raw = struct.pack(f"<{len(values)}{'f' if kind == FLOAT else 'q'}", *values)
-    return b"".join(field(1, each) for each in shape) + field(2, kind) + field(8, name) + field(9, raw) + more
+    return b"".join(field(1, size) for size in shape) + field(2, kind) + field(8, name) + field(9, raw) + more
 
 
 def weight(name: str, values: Sequence[float], *shape: int, kind: int = FLOAT, more: bytes = b"") -> bytes:
@@ -63,7 +62,7 @@ def weight(name: str, values: Sequence[float], *shape: int, kind: int = FLOAT, m
 
 
 def value(name: str, kind: int, *shape: str | int) -> bytes:
-    sizes = b"".join(field(1, field(2 if isinstance(each, str) else 1, each)) for each in shape)
+    sizes = b"".join(field(1, field(2 if isinstance(size, str) else 1, size)) for size in shape)
     return field(1, name) + field(2, field(1, field(1, kind) + field(2, sizes)))
 
 
@@ -97,7 +96,7 @@ def model(
     wave = [amplitude if place % period < period / 2 else -amplitude for place in range(hop)]
     several = speakers > 1
     graph = [
-        # the encoder: how long each sound lasts, and a frame for each of its frames
+        # the encoder: the duration of each phoneme, and its frames
         node("Gather", ["frames_of", "input"], "lasting"),
         node("Gather", ["scales", "one"], "pace"),
         node("Mul", ["lasting", "pace"], "exactly"),
@@ -108,7 +107,7 @@ def model(
         node("Cast", ["places"], "floats", number("to", FLOAT)),
         node("Reshape", ["floats", "as_frames"], "moving"),
         node("Sin", ["moving"], "frames"),
-        # the decoder, which looks at one frame on either side
+        # the decoder, which also uses the frame before and the frame after
         node("Conv", ["frames", cut, "bias"], "pre", numbers("pads", 1, 1)),
     ]
     if several:
@@ -153,20 +152,20 @@ def description(
         "inference": {"noise_scale": 0, "length_scale": 1, "noise_w": 0},
         "num_symbols": len(SOUNDS),
         "num_speakers": speakers,
-        "speaker_id_map": {f"p{each}": each for each in range(speakers)} if speakers > 1 else {},
-        "phoneme_id_map": {sound: [place] for place, sound in enumerate(SOUNDS)},
+        "speaker_id_map": {f"p{speaker}": speaker for speaker in range(speakers)} if speakers > 1 else {},
+        "phoneme_id_map": {sound: [index] for index, sound in enumerate(SOUNDS)},
         **more,
     }
 
 
 def put(directory: Path, name: str, content: bytes | None = None, config: dict[str, object] | None = None) -> Path:
-    """Put a voice into a directory, and return its model's path; `content` is the model, `config` the JSON."""
+    """Put a voice into a directory, and return the path of its model. `content` is the model."""
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / f"{name}.onnx"
     path.write_bytes(model() if content is None else content)
-    told = directory / f"{name}.onnx.json"
-    told.write_text(json.dumps(description() if config is None else config))
-    directory.chmod(0o755)  # whatever the umask is: others may not write
-    for each in (path, told):
-        each.chmod(0o644)
+    config_path = directory / f"{name}.onnx.json"
+    config_path.write_text(json.dumps(description() if config is None else config))
+    directory.chmod(0o755)  # other users must not be able to write, with any umask
+    for file in (path, config_path):
+        file.chmod(0o644)
     return path

@@ -39,7 +39,7 @@ def count(pid: int) -> Usage:
 
 
 def wait_until(pid: int, wanted: Callable[[Usage], bool], within: float = _SETTLE_LIMIT_S) -> Usage:
-    """Wait until the usage is as wanted, and return it. After the time limit, return the last one."""
+    """Wait until the usage is as wanted or the time is over, and return it."""
     end = time.monotonic() + within
     while not wanted(now := count(pid)) and time.monotonic() < end:
         time.sleep(0.05)  # the end of a connection sends no event to others

@@ -1,4 +1,4 @@
-"""A witness for a test: a connection of its own that collects all events of a server."""
+"""A connection that collects all events of a server, for a test."""
 
 from __future__ import annotations
 
@@ -14,87 +14,87 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
 
 T = TypeVar("T")
-#: The numbers of the `hello` requests with which the watcher catches up are above this one.
+#: The watcher's `hello` requests have higher numbers than this.
 _FIRST_SEQ = 1000
 TERMINAL = frozenset({"PREEMPTED", "SUCCEEDED", "ABORTED", "REJECTED", "RECALLED"})
 
 
 class Watcher:
-    """Collects events in a thread, from before the first goal."""
+    """Collects events in a thread. Connect it before the first goal."""
 
     def __init__(self, path: str) -> None:
         self._wire = Wire(path)
         self._changed = threading.Condition()
         self._events: list[Message] = []
-        self._arrivals: dict[int, float] = {}  # by the identity of an event
+        self._arrivals: dict[int, float] = {}  # by the event's `id()`
         self._ended: str | None = None
-        #: the last `hello` that was sent, and the last that was answered
-        self._asked = self._answered = _FIRST_SEQ
+        #: numbers of the last `hello` that was sent and of the last reply
+        self._sent = self._replied = _FIRST_SEQ
         try:
             reply = self._wire.request("watch")
-            assert reply["ok"], f"no watch: {reply}"
+            assert reply["ok"], f"watch was refused: {reply}"
         except BaseException:
             self._wire.close()
             raise
         self._events += self._wire.events
-        self._arrivals |= {id(each): time.monotonic() for each in self._events}
+        self._arrivals |= {id(event): time.monotonic() for event in self._events}
         self._thread = threading.Thread(target=self._read, name="watcher", daemon=True)
         self._thread.start()
 
     def events(self, goal_id: str | None = None) -> list[Message]:
-        """Return all events that the server has sent so far, of one goal or of all goals."""
+        """Return all events that the server has sent so far, for one goal or for all goals."""
         self._catch_up()
         with self._changed:
-            return [each for each in self._events if goal_id is None or each.get("id") == goal_id]
+            return [event for event in self._events if goal_id is None or event.get("id") == goal_id]
 
     def states(self, goal_id: str) -> list[str]:
-        return [each["state"] for each in self.events(goal_id) if each["event"] == "state"]
+        return [event["state"] for event in self.events(goal_id) if event["event"] == "state"]
 
     def texts(self, *states: str) -> list[str]:
-        """Return the texts of the goals that reached one of these states, in the order of these events."""
+        """Return the texts of the goals that reached one of these states, in this order."""
         events = self.events()
-        known = {each["id"]: each["goal"]["text"] for each in events if each.get("goal")}
-        return [known[each["id"]] for each in events if each.get("state") in states]
+        texts = {event["id"]: event["goal"]["text"] for event in events if event.get("goal")}
+        return [texts[event["id"]] for event in events if event.get("state") in states]
 
     def words(self, goal_id: str) -> list[Message]:
-        return [each for each in self.events(goal_id) if each["event"] == "word"]
+        return [event for event in self.events(goal_id) if event["event"] == "word"]
 
     def arrived(self, event: Message) -> float:
         return self._arrivals[id(event)]
 
     def goals(self) -> list[str]:
-        return list(dict.fromkeys(each["id"] for each in self.events() if each.get("id") is not None))
+        return list(dict.fromkeys(event["id"] for event in self.events() if event.get("id") is not None))
 
     def terminal_counts(self) -> dict[str, int]:
         """Return the number of terminal events of each goal."""
         counts = dict.fromkeys(self.goals(), 0)
-        return counts | Counter(each["id"] for each in self.events() if each.get("state") in TERMINAL)
+        return counts | Counter(event["id"] for event in self.events() if event.get("state") in TERMINAL)
 
     def wait_for(self, goal_id: str | None, state: str, timeout: float = PATIENCE) -> Message:
-        """Return the event of a goal's state, or of any goal's if the id is None."""
-        return self.wait_until(lambda each: each.get("state") == state and goal_id in (None, each["id"]), timeout)
+        """Wait until a goal (or any goal, if the id is None) has this state, and return the event."""
+        return self.wait_until(lambda event: event.get("state") == state and goal_id in (None, event["id"]), timeout)
 
     def wait_for_word(self, goal_id: str) -> Message:
-        """Return the first word event of a goal. A goal that is ACTIVE may still wait for an engine."""
-        return self.wait_until(lambda each: each["event"] == "word" and each["id"] == goal_id)
+        """Wait for a goal's first word, because an ACTIVE goal may still be waiting for an engine."""
+        return self.wait_until(lambda event: event["event"] == "word" and event["id"] == goal_id)
 
     def wait_for_terminal(self, goal_id: str, timeout: float = PATIENCE) -> str:
-        """Return the terminal state of an accepted goal."""
+        """Wait until an accepted goal has ended, and return its state."""
         states = TERMINAL - {"REJECTED"}
-        event = self.wait_until(lambda each: each.get("id") == goal_id and each.get("state") in states, timeout)
+        event = self.wait_until(lambda event: event.get("id") == goal_id and event.get("state") in states, timeout)
         return str(event["state"])
 
     def wait_until(self, wanted: Callable[[Message], bool], timeout: float = PATIENCE, what: str = "event") -> Message:
-        """Return the first wanted event, also of those that came before."""
-        found = wait_for_first(self._events, wanted, self._changed, timeout, lambda: self._ended is not None)
-        events = ", ".join(f"{each.get('id')} {each.get('state', each.get('event'))}" for each in self._events)
-        assert found, f"{what}: not within {timeout} s: {self._ended or 'still connected'}; events: {events}"
-        return found
+        """Return the first wanted event, including events that have come already. `what` describes it in messages."""
+        event = wait_for_first(self._events, wanted, self._changed, timeout, lambda: self._ended is not None)
+        events = ", ".join(f"{other.get('id')} {other.get('state', other.get('event'))}" for other in self._events)
+        assert event, f"{what}: not within {timeout} s: {self._ended or 'still connected'}; events: {events}"
+        return event
 
     def wait_for_end(self) -> None:
         """Wait until the server has closed the connection."""
         self._thread.join(PATIENCE)
-        assert not self._thread.is_alive(), f"the server still has the watcher's connection after {PATIENCE} s"
+        assert not self._thread.is_alive(), f"the server has not closed the watcher's connection within {PATIENCE} s"
 
     def close(self) -> None:
         self._wire.shut_down()
@@ -102,35 +102,35 @@ class Watcher:
         self._wire.close()
 
     def check(self, unfinished: Collection[str] | bool = False) -> None:
-        """Assert that `n` only grows, and that each goal has one terminal event and no event after it.
+        """Assert that `n` always grows, and that each goal has one terminal event and no later events.
 
         Args:
-            unfinished: ids of goals that may have no terminal event, or True for all.
+            unfinished: Ids of goals that may have no terminal event, or True for all.
         """
-        numbers = [each["n"] for each in self.events() if "n" in each]
+        numbers = [event["n"] for event in self.events() if "n" in event]
         assert numbers == sorted(set(numbers)), f"event numbers do not grow: {numbers}"
         for goal_id in self.goals():
             events = self.events(goal_id)
-            # A rejected goal may have the id of another goal, at any time.
-            own = [each for each in events if each.get("state") != "REJECTED"]
-            told = f"{goal_id}: {[each.get('state', each['event']) for each in events]}"
-            ends = [place for place, each in enumerate(own) if each.get("state") in TERMINAL]
-            assert len(ends) <= 1, f"more than one terminal state: {told}"
+            # A rejected goal may have the same id as another goal.
+            accepted = [event for event in events if event.get("state") != "REJECTED"]
+            summary = f"{goal_id}: {[event.get('state', event['event']) for event in events]}"
+            ends = [index for index, event in enumerate(accepted) if event.get("state") in TERMINAL]
+            assert len(ends) <= 1, f"more than one terminal state: {summary}"
             if ends:
-                assert ends[0] == len(own) - 1, f"an event after the terminal state: {told}"
-            elif own:
+                assert ends[0] == len(accepted) - 1, f"an event after the terminal state: {summary}"
+            elif accepted:
                 may_be_unfinished = unfinished is True or (unfinished is not False and goal_id in unfinished)
-                assert may_be_unfinished, f"no terminal state: {told}"
+                assert may_be_unfinished, f"no terminal state: {summary}"
 
     def _catch_up(self) -> None:
-        """Wait for the reply to a request, which comes after all earlier events."""
+        """Wait for the reply to a new request, because it comes after all earlier events."""
         with self._changed:
             if self._ended is not None:
                 return
-            self._asked = asked = self._asked + 1
-            with contextlib.suppress(OSError):  # the server has closed, and the thread reads to the end
-                self._wire.send({"seq": asked, "request": "hello"})
-            self._changed.wait_for(lambda: self._answered >= asked or self._ended is not None, PATIENCE)
+            self._sent = seq = self._sent + 1
+            with contextlib.suppress(OSError):  # if the server has closed, the thread reads to the end
+                self._wire.send({"seq": seq, "request": "hello"})
+            self._changed.wait_for(lambda: self._replied >= seq or self._ended is not None, PATIENCE)
 
     def _read(self) -> None:
         try:
@@ -138,7 +138,7 @@ class Watcher:
                 message = self._wire.receive(None)
                 with self._changed:
                     if message.get("seq", 0) > _FIRST_SEQ and "ok" in message:
-                        self._answered = message["seq"]
+                        self._replied = message["seq"]
                     elif message.get("event") != "alive":
                         self._events.append(message)
                         self._arrivals[id(message)] = time.monotonic()
@@ -156,16 +156,16 @@ def wait_for_first(
     within: float,
     over: Callable[[], bool],
 ) -> T | None:
-    """Return the first wanted item of a list that grows, None if it doesn't come in time or the list is over."""
+    """Return the first wanted item of a growing list, or None if it doesn't come in time or `over` becomes true."""
     seen = 0
     end = time.monotonic() + within
     with changed:
         while True:
-            for each in items[seen:]:
-                if wanted(each):
-                    return each
+            for item in items[seen:]:
+                if wanted(item):
+                    return item
             seen = len(items)
-            left = end - time.monotonic()
-            if left <= 0 or over():
+            remaining = end - time.monotonic()
+            if remaining <= 0 or over():
                 return None
-            changed.wait(left)
+            changed.wait(remaining)

@@ -1,6 +1,6 @@
-"""The faults of the fleet's soak, and the judge of what the desks were told.
+"""The faults of the fleet's soak test, and the check of its goals.
 
-The judge compares that with what the robot spoke, and with the results that reached the broker.
+The check compares the ends that the desks received with what the robot spoke, and with the results at the broker.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from tests.support.mqtt import Listener
 from tests.tools.fleet_soak_desks import UNSPOKEN
-from tests.tools.soak_faults import FaultsInTurn
+from tests.tools.soak_faults import FaultInjector
 
 if TYPE_CHECKING:
     import random
@@ -24,42 +24,42 @@ if TYPE_CHECKING:
     from tests.support.processes import Talk
     from tests.support.proxy import Direction, Proxy
     from tests.tools.fleet_soak_desks import Ledger
-    from tests.tools.witness import Witness
+    from tests.tools.goal_monitor import GoalMonitor
 
 _AWAY_S = (0.1, 3.0)
-#: Within 6 s the robot accepts what was sent meanwhile, after that it is stale.
-_HELD_S = ((1.0, 5.5), (8.0, 9.0))
+#: Shorter and longer than the 6 s after which a robot refuses requests as stale.
+_STALLED_S = ((1.0, 5.5), (8.0, 9.0))
 _DIRECTIONS: tuple[tuple[Direction, ...], ...] = ((), ("to_client",), ("to_broker",))
-#: Seconds in which a new bridge has asked its server for the goals that it knows.
-_REMEMBERING_S = 6.0
-#: Seconds after which everything that has happened was noted.
+#: Time in which a new bridge gets the goals that its server knows.
+_RELOAD_S = 6.0
+#: Time after which all events have been recorded.
 _DELAY_S = 1.0
-#: Seconds under way after which a robot refuses a goal.
+#: Age from which a robot refuses a goal.
 _STALE_S = 6.0
 
 
 @dataclass(slots=True)
 class Outages:
-    """When each process was killed (wall clock)."""
+    """The times at which each process was killed (Unix times)."""
 
     broker: list[float] = field(default_factory=list)
     server: list[float] = field(default_factory=list)
     bridge: list[float] = field(default_factory=list)
 
     def excuse_repeat(self, sent: float, first: float, second: float) -> bool:
-        """Whether a goal may be spoken twice: both the server and the bridge that knew its id were killed."""
-        servers = [each for each in self.server if first < each < second]
-        bridges = [each for each in self.bridge if sent < each < second]
-        return any(bridge > server - _REMEMBERING_S for server in servers for bridge in bridges)
+        """Whether a goal may be spoken twice, because the server and the bridge that knew its id were both killed."""
+        servers = [killed for killed in self.server if first < killed < second]
+        bridges = [killed for killed in self.bridge if sent < killed < second]
+        return any(bridge > server - _RELOAD_S for server in servers for bridge in bridges)
 
     def excuse_lost(self, reached: float, ended: float) -> bool:
-        """Whether a desk may miss a result: both the broker that had it and the server that could repeat it died."""
-        died = any(reached - _DELAY_S < each < reached + _DELAY_S for each in self.broker)
-        return died and any(reached - _DELAY_S < each < ended for each in self.server)
+        """Whether a desk may miss a result, because the broker that had it and its server were both killed."""
+        broker_killed = any(reached - _DELAY_S < killed < reached + _DELAY_S for killed in self.broker)
+        return broker_killed and any(reached - _DELAY_S < killed < ended for killed in self.server)
 
 
-class Overheard:
-    """Listens to all answers of the robot at the broker, on a new connection after each restart."""
+class ReplyRecorder:
+    """Receives all of the robot's replies from the broker, with a new connection after each restart."""
 
     def __init__(self, broker: Broker) -> None:
         self._broker = broker
@@ -79,7 +79,7 @@ class Overheard:
         self._listener = None
 
     def results(self) -> dict[str, float]:
-        """Return when the broker had the first result of each goal (wall clock)."""
+        """Return the Unix time at which the broker received the first result of each goal."""
         with self._lock:
             messages = self._listener.messages[self._seen :] if self._listener else []
             self._seen += len(messages)
@@ -91,69 +91,74 @@ class Overheard:
             return dict(self._results)
 
 
-class FleetFaults(FaultsInTurn):
-    """The faults of a robot at a broker."""
-
+class FleetFaults(FaultInjector):
     def __init__(
-        self, chance: random.Random, talk: Talk, broker: Broker, bridge: Bridge, proxy: Proxy, overheard: Overheard
+        self, rng: random.Random, talk: Talk, broker: Broker, bridge: Bridge, proxy: Proxy, replies: ReplyRecorder
     ) -> None:
-        super().__init__(chance)
+        super().__init__(rng)
         self._talk, self._broker, self._bridge, self._proxy = talk, broker, bridge, proxy
-        self._overheard = overheard
+        self._replies = replies
         self.outages = Outages()
-        kinds = (self.broker_killed, self.bridge_killed, self.bridge_stopped, self.server_killed, self.link_held)
-        self.kinds = {each.__name__: each for each in (*kinds, proxy.cut)}
+        kinds = (
+            self.broker_killed,
+            self.bridge_killed,
+            self.bridge_stopped,
+            self.server_killed,
+            self.connection_stalled,
+        )
+        self.kinds = {kind.__name__: kind for kind in (*kinds, proxy.cut)}
 
     def broker_killed(self) -> None:
         self.outages.broker.append(time.time())
         self._broker.kill()
-        self._overheard.close()
-        time.sleep(self.chance.uniform(*_AWAY_S))
+        self._replies.close()
+        time.sleep(self.rng.uniform(*_AWAY_S))
         self._broker.start()
-        self._overheard.listen()
+        self._replies.listen()
 
     def bridge_killed(self) -> None:
         self.outages.bridge.append(time.time())
         self._bridge.kill()
-        time.sleep(self.chance.uniform(*_AWAY_S))
+        time.sleep(self.rng.uniform(*_AWAY_S))
         self._bridge.start()
 
     def bridge_stopped(self) -> None:
         self._bridge.stop_process()
-        time.sleep(self.chance.uniform(*self.chance.choice(_HELD_S)))
+        time.sleep(self.rng.uniform(*self.rng.choice(_STALLED_S)))
         self._bridge.resume_process()
 
     def server_killed(self) -> None:
         self.outages.server.append(time.time())
         self._talk.kill()
-        time.sleep(self.chance.uniform(*_AWAY_S))
+        time.sleep(self.rng.uniform(*_AWAY_S))
         self._talk.start_server()
 
-    def link_held(self) -> None:
-        self._proxy.hold(*self.chance.choice(_DIRECTIONS))
-        time.sleep(self.chance.uniform(*self.chance.choice(_HELD_S)))
+    def connection_stalled(self) -> None:
+        self._proxy.hold(*self.rng.choice(_DIRECTIONS))
+        time.sleep(self.rng.uniform(*self.rng.choice(_STALLED_S)))
         self._proxy.release()
 
 
-def judge(ledger: Ledger, witness: Witness, overheard: Overheard, outages: Outages) -> None:
-    """Assert that nothing is wrong with the goals so far."""
-    results = overheard.results()
+def check_goals(ledger: Ledger, monitor: GoalMonitor, replies: ReplyRecorder, outages: Outages) -> None:
+    """Assert that all goals so far were spoken and ended correctly."""
+    results = replies.results()
     now = time.time()
     for goal in list(ledger.goals):
-        begun = witness.begun(goal.text)
-        told = f"{goal}, spoken at {begun}, {outages}"
-        known = {how for how, at in goal.ends if at < now - _DELAY_S}
+        starts = monitor.starts(goal.text)
+        details = f"{goal}, spoken at {starts}, {outages}"
+        known = {end for end, at in goal.ends if at < now - _DELAY_S}
         all_known = all(at < now - _DELAY_S for _, at in goal.ends)
-        repeats = all(outages.excuse_repeat(goal.sent_at[0], *each) for each in pairwise(begun))
-        assert repeats, f"spoken {len(begun)} times: {told}"
-        for at in begun:
-            late = at - max((each for each in goal.sent_at if each < at), default=goal.sent_at[0])
-            assert goal.ttl is None or late <= goal.ttl + _STALE_S, f"begun {late:.1f} s after it was sent: {told}"
-        assert not (begun and known and known <= UNSPOKEN and all_known), (
-            f"spoken, but its desk was not told so: {told}"
-        )
-        assert begun or not known & {"SUCCEEDED", "PREEMPTED"}, f"not spoken, but its desk was told so: {told}"
+        repeats = all(outages.excuse_repeat(goal.sent_at[0], *pair) for pair in pairwise(starts))
+        assert repeats, f"spoken {len(starts)} times: {details}"
+        for at in starts:
+            age = at - max((sent for sent in goal.sent_at if sent < at), default=goal.sent_at[0])
+            assert goal.ttl is None or age <= goal.ttl + _STALE_S, f"spoken {age:.1f} s after it was sent: {details}"
+        unspoken = known and known <= UNSPOKEN and all_known
+        assert not (starts and unspoken), f"spoken, but reported as not spoken: {details}"
+        assert starts or not known & {"SUCCEEDED", "PREEMPTED"}, f"not spoken, but reported as spoken: {details}"
         reached = results.get(goal.id)
-        for how, at in goal.ends if goal.once else ():
-            lost = how == "LOST" and reached is not None and reached < at - _DELAY_S
-            assert not lost or outages.excuse_lost(results[goal.id], at), f"LOST, but the broker had its result: {told}"
+        for end, at in goal.ends if goal.once else ():
+            lost = end == "LOST" and reached is not None and reached < at - _DELAY_S
+            assert not lost or outages.excuse_lost(results[goal.id], at), (
+                f"LOST, but the broker had its result: {details}"
+            )

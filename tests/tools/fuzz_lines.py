@@ -53,12 +53,13 @@ _ADDITIONS: dict[str, tuple[object, ...]] = {
 #: Names of goals that the additions are for.
 _GROWING = 5
 _INSERTED = (b'"', b"{", b"}", b"[", b",", b"null", b"1e999", b"-", b"\\u0000")
-#: Lines on one connection. A hello follows each, because ten bad lines in a row end a connection.
+#: Lines per connection. Each is followed by a hello, because the server closes after ten bad lines in a row.
 BATCH = 1_000
 _HELLO = b'{"request": "hello"}\n'
-#: Ends each batch, because an addition to a long text is answered only when the text was heard or its goal has ended.
+#: Ends each batch, because the reply to an addition to a long text only comes when the text was heard or its goal has
+#: ended.
 _CANCEL = b'{"request": "cancel"}\n'
-#: The server keeps texts, and events that its clients haven't read yet.
+#: The server keeps texts, and events that clients haven't read yet.
 _GROWTH_LIMIT_KB = 24 * 1024
 _REPLY_LIMIT_S = 60
 
@@ -76,15 +77,15 @@ def additions(source: random.Random) -> Iterator[str]:
         yield json.dumps({"request": "append", **fields, **{name: source.choice(_ADDITIONS[name]) for name in chosen}})
 
 
-def mutated(source: random.Random) -> Iterator[bytes]:
-    """Yield requests with some bytes changed, lost, doubled or taken from other requests."""
-    whole = [each.encode() for each in LINES]
+def mutated_lines(source: random.Random) -> Iterator[bytes]:
+    """Yield requests in which bytes are changed, removed, repeated, inserted or replaced by other requests."""
+    lines = [line.encode() for line in LINES]
     growing = additions(source)
     while True:
         if source.random() < 0.2:
             yield next(growing).encode() + b"\n"
             continue
-        line = bytearray(source.choice(whole))
+        line = bytearray(source.choice(lines))
         for _ in range(source.choice((0, 1, 1, 1, 2, 4, 16))):
             place = source.randrange(len(line) + 1)
             kind = source.randrange(5)
@@ -95,7 +96,7 @@ def mutated(source: random.Random) -> Iterator[bytes]:
             elif kind == 2:
                 line[place:place] = line[place : place + source.randrange(1, 20)]
             elif kind == 3:
-                other = source.choice(whole)
+                other = source.choice(lines)
                 line[place:] = other[source.randrange(len(other)) :]
             else:
                 line[place:place] = source.choice(_INSERTED)
@@ -105,11 +106,11 @@ def mutated(source: random.Random) -> Iterator[bytes]:
 def fuzz(seed: int, *, count: float = float("inf"), seconds: float = float("inf")) -> Counter[str]:
     """Send mutated lines to a server until the count or the time is reached, and count the replies by error code."""
     replies: Counter[str] = Counter()
-    lines = mutated(random.Random(seed))
+    lines = mutated_lines(random.Random(seed))
     with contextlib.closing(Talk(scripted=True, watched=False)) as talk:
         end = time.monotonic() + seconds
         _speak(talk, "length=0")
-        before = usage.count(talk.pid)  # with a running engine
+        before = usage.count(talk.pid)  # now the engine runs
         while replies.total() < 2 * count and time.monotonic() < end:
             _send_batch(talk, list(islice(lines, BATCH)), replies)
         assert talk.request("resume")["ok"]
@@ -132,7 +133,7 @@ def _send_batch(talk: Talk, batch: list[bytes], replies: Counter[str]) -> None:
     end = time.monotonic() + _REPLY_LIMIT_S  # the server shows that it is alive all the time
     with Raw(talk.socket) as raw:
         raw.socket.settimeout(_REPLY_LIMIT_S)
-        sender = threading.Thread(target=raw.send, args=(b"".join(each + _HELLO for each in batch) + _CANCEL,))
+        sender = threading.Thread(target=raw.send, args=(b"".join(line + _HELLO for line in batch) + _CANCEL,))
         sender.start()
         rest = b""
         while replies.total() < wanted and time.monotonic() < end and (data := raw.receive(_REPLY_LIMIT_S)):

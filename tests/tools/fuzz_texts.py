@@ -1,11 +1,11 @@
-"""Speak mutated texts with all voices in engine processes, as `say -o` does, and count how often a process dies.
+"""Speak mutated texts with all voices in engine processes, as `say -o` does, and count the crashes.
 
     python -m tests.tools.fuzz_texts --count 20000 [--seed N | --seed today] [--seconds N] [--no-guard] [--growing]
 
-It prints each text that killed a process as a Python literal. The exit code is 1 if a goal didn't have exactly one end,
-if a process hung or left a traceback, if a word isn't in its place, or if the guard let a text through that overflows a
-buffer. The texts depend on the seed alone. They must not depend on the guard. With `--growing`, each text is sent in
-pieces of a few characters while it is spoken.
+It prints each text that crashed a process as a Python literal. The exit code is 1 if a goal didn't have exactly one
+end, if a process hung or printed a traceback, if a word isn't in its place, or if a text overflowed a buffer in spite
+of the guard. The texts only depend on the seed. They must not depend on the guard. With `--growing`, each text is sent
+in pieces of a few characters while it is spoken.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from talkcli.goals.options import bad_text
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
-#: Words per minute: the fastest rate makes the fewest samples.
+#: Words per minute. The fastest rate makes the fewest samples.
 _RATE = 450
-#: Far above what the longest text takes, so that a busy machine is no failure.
+#: Much longer than the longest text takes, so that a busy machine doesn't cause a failure.
 _START_LIMIT_S, _HANG_LIMIT_S = 20.0, 60.0
-#: Time after which the end of a piece may end a sentence, and how often it passes.
-_QUIET_S, _QUIET_CHANCE = 0.12, 0.02
-#: How a process dies that wrote past the end of a buffer. The guard prevents that.
+#: Pause between two pieces after which the end of the first piece may end a sentence, and how often there is a pause.
+_PAUSE_S, _PAUSE_CHANCE = 0.12, 0.02
+#: Signal that ends a process that wrote past the end of a buffer. The guard must prevent this.
 OVERFLOW = "SIGABRT"
 _WITHOUT_GUARD = "from talkcli.engine.child.synthesizers import guard; guard.guarded = lambda text, voice: text; "
 SENTENCES = (
@@ -99,47 +99,43 @@ _PIECES = (
     *("²", "IV", "Mr.", "'s", "ß", "ſ", "ı", "İ", "ﬁ", "㎏", "Ⅷ", "&#x41;", "<a>"),
 )
 _BLANKS = (".", ",", "", "-", ". ", " . ", "'", "\u00a0", "_", "\n")
-#: Most texts are short: a long one takes a hundred times as long to speak, and few crashes need one.
+#: Most texts are short. Long texts take a hundred times as long, and few crashes need them.
 _SHORT_CHARS, _MEDIUM_CHARS, _LONG_CHARS = 24, 220, 1500
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A text, and the voice that speaks it."""
-
     voice: str
     text: str
 
 
-def today() -> int:
-    """Return a seed that is new each day."""
+def daily_seed() -> int:
     return dt.datetime.now(dt.timezone.utc).date().toordinal()
 
 
 def cases(seed: int, voices: Sequence[str]) -> Iterator[Case]:
-    """Yield valid texts for all voices in turn, twenty for each."""
+    """Yield valid texts for all voices, twenty for each voice in turn."""
     source = random.Random(seed)
     while True:
         for voice in source.sample(voices, len(voices)):
             for _ in range(20):
-                while bad_text(text := made(source)) is not None:
+                while bad_text(text := random_text(source)) is not None:
                     pass
                 yield Case(voice, text)
 
 
-def made(source: random.Random) -> str:
-    """Return one mutated text."""
-    longest = source.choices((_SHORT_CHARS, _MEDIUM_CHARS, _LONG_CHARS), (78, 20, 2))[0]
-    text = source.choice(_ORIGINS)(source)[:longest]
+def random_text(source: random.Random) -> str:
+    limit = source.choices((_SHORT_CHARS, _MEDIUM_CHARS, _LONG_CHARS), (78, 20, 2))[0]
+    text = source.choice(_ORIGINS)(source)[:limit]
     for _ in range(source.choice((0, 1, 1, 2, 3, 5, 8))):
         if not text:
             break
-        text = source.choice(_MUTATIONS)(source, text)[:longest]
+        text = source.choice(_MUTATIONS)(source, text)[:limit]
     return text
 
 
 def crashers(source: random.Random) -> Iterator[tuple[str | None, str]]:
-    """Yield texts that crash an unguarded library, each kind in turn, with the voice if the crash needs one."""
+    """Yield texts that crash the library without the guard, each with its voice (None if any voice crashes)."""
     while True:
         between = source.choice((".", ". ", ".,", " . ", "..", ".՞", ".;"))
         before = source.choice(("", "Hello, ", "http://", "5 ", "« "))
@@ -156,7 +152,7 @@ def _letter(source: random.Random) -> str:
     return source.choice("abcdefghijklmnopqrstuvwxyzéßжшλ")
 
 
-# -- the texts to begin with
+# -- original texts
 
 
 def _sentence(source: random.Random) -> str:
@@ -187,7 +183,7 @@ def _pieces(source: random.Random) -> str:
 
 
 def _repeated(source: random.Random) -> str:
-    """Repeat a few characters until they fill a table or a buffer."""
+    """Repeat a few characters, to fill the library's tables and buffers."""
     motif = source.choice((_pieces, _any_characters, _sentence, _words_of_several_languages))(source)
     start = source.randrange(len(motif) + 1)
     motif = motif[start : start + source.randrange(1, 6)] + source.choice(_BLANKS) * source.randrange(2)
@@ -197,18 +193,18 @@ def _repeated(source: random.Random) -> str:
 @cache
 def _assigned() -> str:
     """Return all assigned characters, but only some of the 90,000 Chinese and Korean ones."""
-    found = []
+    characters = []
     for code in range(1, sys.maxunicode + 1):
         category = unicodedata.category(chr(code))
         if category in {"Cn", "Cs", "Co"} or (0x3400 <= code < 0xA000 or 0x17000 <= code < 0x19000 or code > 0x1FFFF):
             if category == "Lo" and code % 97 == 0:
-                found.append(chr(code))
+                characters.append(chr(code))
         elif not (0xAC00 <= code < 0xD7A4 and code % 31):
-            found.append(chr(code))
-    return "".join(found)
+            characters.append(chr(code))
+    return "".join(characters)
 
 
-# -- the mutations
+# -- mutations
 
 
 def _double(source: random.Random, text: str) -> str:
@@ -269,39 +265,37 @@ _MUTATIONS: tuple[Callable[[random.Random, str], str], ...] = (
 )
 
 
-# -- speaking them
+# -- speaking
 
 
 @dataclass(slots=True)
 class Tally:
-    """Results of a run."""
-
     texts: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
-    deaths: list[str] = field(default_factory=list)  # each with the voice and the text
+    deaths: list[str] = field(default_factory=list)  # crashes, with the voice and the text
     faults: list[str] = field(default_factory=list)
 
     def __str__(self) -> str:
         ended = ", ".join(f"{count} {name}" for name, count in self.outcomes.most_common())
-        return f"{self.texts} texts: {ended}; {len(self.deaths)} deaths of the engine process"
+        return f"{self.texts} texts: {ended}; {len(self.deaths)} crashes of the engine process"
 
     @property
     def overflows(self) -> list[str]:
-        """The deaths by a kind of error that the guard knows."""
-        return [each for each in self.deaths if OVERFLOW in each]
+        """The crashes that the guard must prevent."""
+        return [death for death in self.deaths if OVERFLOW in death]
 
 
 def engine_command(guarded: bool) -> list[str]:
-    """Return the command line of an engine process, with or without the guard before the library."""
+    """Return the command of an engine process, with or without the guard for the library."""
     *program, code = process.engine_command()
     return [*program, code if guarded else code.replace("from talkcli", f"{_WITHOUT_GUARD}from talkcli", 1)]
 
 
 def speak_all(texts: Iterable[Case], *, guarded: bool, seconds: float = float("inf"), growing: bool = False) -> Tally:
-    """Speak the texts, whole or in pieces, until they or the time are used up."""
+    """Speak texts, whole or in pieces, until all are spoken or the time is over."""
     tally = Tally()
     command = engine_command(guarded)
-    left = iter(texts)
+    remaining = iter(texts)
     end = time.monotonic() + seconds
     with (
         tempfile.TemporaryDirectory(prefix="talk-") as directory,
@@ -309,7 +303,7 @@ def speak_all(texts: Iterable[Case], *, guarded: bool, seconds: float = float("i
             process, engine_command=lambda: command, START_LIMIT_S=_START_LIMIT_S, HANG_LIMIT_S=_HANG_LIMIT_S
         ),
     ):
-        while _speak_until_death(left, end, f"{directory}/spoken.wav", tally, growing=growing):
+        while _speak_until_crash(remaining, end, f"{directory}/spoken.wav", tally, growing=growing):
             pass
     return tally
 
@@ -325,17 +319,17 @@ def split(text: str, source: random.Random) -> Iterator[str]:
 
 
 def speak_growing(engine: PrivateEngine, goal: str, case: Case, pieces: Sequence[str], source: random.Random) -> None:
-    """Send a text in pieces, sometimes with a pause between two of them."""
+    """Send a text in pieces, some of them after a pause."""
     engine.speak(protocol.Speak(goal, pieces[0], _RATE, 1.0, case.voice, 50, more=True))
     for piece in pieces[1:]:
-        if source.random() < _QUIET_CHANCE:
-            time.sleep(_QUIET_S)
+        if source.random() < _PAUSE_CHANCE:
+            time.sleep(_PAUSE_S)
         engine._process.send(protocol.Append(goal, piece, end=False))
     engine._process.send(protocol.Append(goal, "", end=True))
 
 
 def find_lost_text(text: str, pieces: Iterable[str], source: random.Random) -> str | None:
-    """Cut a text that grows by these pieces, and return what is wrong with its parts, or None."""
+    """Cut a text that grows by these pieces. Return a message if the parts don't contain the whole text."""
     growing, now, parts = GrowingText("", ended=False), 0.0, []
     for piece in (*pieces, ""):
         growing.append(piece, now)
@@ -347,7 +341,7 @@ def find_lost_text(text: str, pieces: Iterable[str], source: random.Random) -> s
 
 
 def find_misplaced_word(text: str, words: Iterable[protocol.Word]) -> str | None:
-    """Return what is wrong with the words of a goal, or None."""
+    """Return a message if a word of a goal is not in its place."""
     before = 0
     for number, word in enumerate(words, 1):
         if word.number != number or not before <= word.start < word.end <= len(text):
@@ -356,11 +350,11 @@ def find_misplaced_word(text: str, words: Iterable[protocol.Word]) -> str | None
     return None
 
 
-def _speak_until_death(texts: Iterator[Case], end: float, path: str, tally: Tally, *, growing: bool) -> bool:
-    """Speak texts in one engine process; return whether it died."""
+def _speak_until_crash(texts: Iterator[Case], end: float, path: str, tally: Tally, *, growing: bool) -> bool:
+    """Speak texts in one engine process. Return whether it crashed."""
     with PrivateEngine(protocol.Configure(os.getpid(), None, f"file:{path}", None, None)) as engine:
         engine.wait_for(protocol.Ready)
-        # The first text is spoken even if the start took all the time.
+        # At least one text is spoken, even if the start has used up the time.
         for number, case in enumerate(texts):
             tally.texts += 1
             goal, wrong, words = f"f{number}", None, []
@@ -386,7 +380,7 @@ def _speak_until_death(texts: Iterator[Case], end: float, path: str, tally: Tall
             wrong = wrong or find_misplaced_word(case.text, words)
             if ended.id != goal or outcome == "engine_failed" or wrong:
                 tally.faults.append(f"{wrong or ended}: {case.voice} {case.text!a}")
-            with contextlib.suppress(FileNotFoundError):  # there was nothing to say
+            with contextlib.suppress(FileNotFoundError):  # the text had no sound
                 os.unlink(path)
             if time.monotonic() >= end:
                 break
@@ -396,7 +390,7 @@ def _speak_until_death(texts: Iterator[Case], end: float, path: str, tally: Tall
 def list_voices() -> list[str]:
     configure = protocol.Configure(os.getpid(), None, "null", None, None, list_voices=True)
     with PrivateEngine(configure) as engine:
-        return [each.id for each in engine.wait_for(protocol.VoiceList).voices if not each.id.startswith("+")]
+        return [voice.id for voice in engine.wait_for(protocol.VoiceList).voices if not voice.id.startswith("+")]
 
 
 def main() -> int:
@@ -406,13 +400,13 @@ def main() -> int:
     parser.add_argument("--seed", default="1", help='a number, or "today"')
     parser.add_argument("--no-guard", action="store_true")
     parser.add_argument("--growing", action="store_true", help="send each text in pieces")
-    asked = parser.parse_args()
-    seed = today() if asked.seed == "today" else int(asked.seed)
-    texts = itertools.islice(cases(seed, list_voices()), asked.count)
-    tally = speak_all(texts, guarded=not asked.no_guard, seconds=asked.seconds, growing=asked.growing)
+    options = parser.parse_args()
+    seed = daily_seed() if options.seed == "today" else int(options.seed)
+    texts = itertools.islice(cases(seed, list_voices()), options.count)
+    tally = speak_all(texts, guarded=not options.no_guard, seconds=options.seconds, growing=options.growing)
     print(*tally.deaths, *map("fault: {}".format, tally.faults), sep="\n")
     print(f"seed {seed}: {tally}, {len(tally.overflows)} overflows")
-    return 1 if tally.faults or (tally.overflows and not asked.no_guard) else 0
+    return 1 if tally.faults or (tally.overflows and not options.no_guard) else 0
 
 
 if __name__ == "__main__":

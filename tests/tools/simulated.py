@@ -1,10 +1,10 @@
-"""Hundreds of robots in one process: real bridges and real servers, but an engine that makes no sound.
+"""Hundreds of robots in one process, with real bridges and servers, but with engines that make no sound.
 
     python -m tests.tools.simulated --robots 250 --first 1 --broker mqtt://127.0.0.1:1883
 
-The robots are sim-0001 and so on. A sentence takes one second, or the SECONDS of `length=SECONDS` in its text. A line
-on standard output tells when all robots are online. Each sentence that begins is a JSON line in the file of `--spoken`:
-the robot, the id, the text, and the monotonic time. SIGTERM ends the robots.
+The robots are called sim-0001 and so on. A sentence takes one second, or SECONDS if its text contains `length=SECONDS`.
+When all robots are online, the program prints a line. For each sentence that starts, it writes a JSON line with the
+robot, id, text and monotonic time to the file given with `--spoken`. SIGTERM ends the robots.
 """
 
 from __future__ import annotations
@@ -46,25 +46,25 @@ if TYPE_CHECKING:
 
     from talkcli.goals.goal import JsonObject
 
-_USUAL_LENGTH_S = 1.0
+_DEFAULT_LENGTH_S = 1.0
 _LENGTH = re.compile(r"\blength=(\d+(?:\.\d+)?)")
-#: Descriptors of a robot: its socket, three connections with two ends each, the broker's, and those of paho.
+#: Descriptors per robot: its socket, both ends of three connections, the broker's connection, and those of paho.
 _DESCRIPTORS = 12
-_LOOK_EVERY_S = 0.05
+_POLL_INTERVAL_S = 0.05
 
 
 class SilentEngine:
-    """Takes the time of a sentence. It replaces a server's `Supervisor`, without a thread and a process."""
+    """A replacement for a server's `Supervisor`. It only waits for the length of each sentence."""
 
-    def __init__(self, report: Callable[[Any], None], begun: Callable[[str, str], None]) -> None:
-        """`begun` is called with the id and the text of each goal that begins."""
-        self._report, self._begun = report, begun
+    def __init__(self, report: Callable[[Any], None], on_start: Callable[[str, str], None]) -> None:
+        """`on_start` is called with the id and the text of each goal that starts."""
+        self._report, self._on_start = report, on_start
         self._goal = ""
 
     def speak(self, command: protocol.Speak) -> None:
-        self._begun(command.id, command.text)
-        found = _LENGTH.search(command.text)
-        length = float(found.group(1)) if found else _USUAL_LENGTH_S
+        self._on_start(command.id, command.text)
+        match = _LENGTH.search(command.text)
+        length = float(match.group(1)) if match else _DEFAULT_LENGTH_S
         self._goal = command.id
         asyncio.get_running_loop().call_later(length, self._end, command.id, protocol.OUTCOME_COMPLETED, length)
 
@@ -81,14 +81,14 @@ class SilentEngine:
 
 
 class Server:
-    """A robot's server, listening. It handles its connections and admits everybody."""
+    """A robot's server, which accepts all clients."""
 
-    def __init__(self, path: str, begun: Callable[[str, str], None], descriptors: int) -> None:
-        boot = "".join(random.choice(each) for each in (string.digits, string.ascii_lowercase) * 2)
+    def __init__(self, path: str, on_start: Callable[[str, str], None], descriptors: int) -> None:
+        boot = "".join(random.choice(characters) for characters in (string.digits, string.ascii_lowercase) * 2)
         self._path = path
         self._scheduler = Scheduler(boot, max_queue=100)
         self._speech = speech = Speech(self._scheduler)
-        speech.engine = cast("Any", SilentEngine(speech.report, begun))
+        speech.engine = cast("Any", SilentEngine(speech.report, on_start))
         speech.report(protocol.Ready("simulated", None, "none"))
         speech.report(protocol.VoiceList((protocol.Voice("en", "en", "simulated"),)))
         self._requests = Requests(speech, self._describe)
@@ -99,7 +99,7 @@ class Server:
         self._socket.setblocking(False)
         self._socket.bind(path)
         self._socket.listen()
-        self._acceptor = Acceptor(lambda each: ClientConnection(self, speech.streams, each).begin(), descriptors)
+        self._acceptor = Acceptor(lambda client: ClientConnection(self, speech.streams, client).begin(), descriptors)
         self._acceptor.open(self._socket)
 
     def joined(self, connection: ClientConnection) -> None:
@@ -125,7 +125,6 @@ class Server:
 
 
 async def run(names: list[str], broker_url: str, directory: str, spoken: TextIO) -> None:
-    """Run robots until SIGTERM."""
     loop = asyncio.get_running_loop()
     loop.set_exception_handler(log.handle_loop_error)
     descriptors = raise_descriptor_limit(_DESCRIPTORS * len(names))
@@ -139,45 +138,45 @@ async def run(names: list[str], broker_url: str, directory: str, spoken: TextIO)
         Bridge(BridgeSettings(name, ALLOWABLE_REQUESTS, (), f"{directory}/{name}"), lambda: broker) for name in names
     ]
 
-    look: asyncio.TimerHandle | None = None
+    timer: asyncio.TimerHandle | None = None
 
-    def tell_ready() -> None:
-        nonlocal look
-        if not all(each._online and each._publisher.server for each in bridges):
-            look = loop.call_later(_LOOK_EVERY_S, tell_ready)
+    def report_online() -> None:
+        nonlocal timer
+        if not all(bridge._online and bridge._publisher.server for bridge in bridges):
+            timer = loop.call_later(_POLL_INTERVAL_S, report_online)
             return
-        # A garbage collection of everything would delay hundreds of robots.
+        # Later garbage collections of all objects would delay hundreds of robots.
         gc.collect()
         gc.freeze()
         print(f"{len(bridges)} robots are online", flush=True)
 
     def end() -> None:
-        for each in bridges:
-            each.end()
+        for bridge in bridges:
+            bridge.end()
 
-    tell_ready()
+    report_online()
     loop.add_signal_handler(signal.SIGTERM, end)
     try:
-        await asyncio.gather(*(each.run() for each in bridges))
+        await asyncio.gather(*(bridge.run() for bridge in bridges))
     finally:
-        if look:
-            look.cancel()
+        if timer:
+            timer.cancel()
         for server in servers:
             server.close()
 
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--robots", type=int, default=100, help="how many (%(default)s)")
+    parser.add_argument("--robots", type=int, default=100, help="number of robots (%(default)s)")
     parser.add_argument("--first", type=int, default=1, help="the number of the first robot (%(default)s)")
     parser.add_argument("--broker", required=True, metavar="URL")
-    parser.add_argument("--spoken", default=os.devnull, metavar="FILE", help="for the sentences that begin")
-    asked = parser.parse_args()
-    names = [f"sim-{number:04d}" for number in range(asked.first, asked.first + asked.robots)]
+    parser.add_argument("--spoken", default=os.devnull, metavar="FILE", help="file for the sentences that start")
+    options = parser.parse_args()
+    names = [f"sim-{number:04d}" for number in range(options.first, options.first + options.robots)]
     with contextlib.ExitStack() as stack:
         directory = stack.enter_context(tempfile.TemporaryDirectory(prefix="sim-"))
-        spoken = stack.enter_context(open(asked.spoken, "a", 1, encoding="utf-8"))  # line by line
-        asyncio.run(run(names, asked.broker, directory, spoken))
+        spoken = stack.enter_context(open(options.spoken, "a", 1, encoding="utf-8"))  # line by line
+        asyncio.run(run(names, options.broker, directory, spoken))
 
 
 if __name__ == "__main__":

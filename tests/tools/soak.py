@@ -1,10 +1,10 @@
-"""Random goals and growing texts from many clients with a fault every few seconds, for as long as one likes.
+"""Soak test of a server: random goals and growing texts from many clients, and a fault every few seconds.
 
     python -m tests.tools.soak --seconds 1800 [--seed N] [--every SECONDS | --kills] [--player aplay|pacat]
 
-Every goal must have exactly one end, each goal that SUCCEEDED must have been heard, and the server must not take more
-of the machine at the end than at the beginning. With `--kills` the only fault is a killed engine, up to twice a second,
-and each kill may cost one goal at most. An error raises an exception.
+Each goal must have exactly one end, each goal that SUCCEEDED must have been heard, and the server must not use more
+resources at the end than at the beginning. With `--kills`, the only fault is a killed engine, up to twice per second,
+and each kill may cost at most one goal. An error raises an exception.
 """
 
 from __future__ import annotations
@@ -22,27 +22,25 @@ from tests.support import usage
 from tests.support.processes import Talk
 from tests.support.sink import Sink
 from tests.support.surroundings import short_directory
+from tests.tools.goal_monitor import GoalMonitor
 from tests.tools.soak_clients import Narrator, Workers, send_goals
-from tests.tools.soak_faults import Faults
+from tests.tools.soak_faults import RobotFaults
 from tests.tools.soak_growing import send_growing_texts
-from tests.tools.witness import Witness
 
-#: Clients with usual goals, and with texts that grow.
+#: Clients that send usual goals, and clients that send growing texts.
 _CLIENTS, _GROWING_CLIENTS = 8, 3
-#: Goals before the first census: then most of the history is full, and everything was used once.
+#: Goals before the first count of resources. By then, the history is almost full, and all code has run once.
 _WARM_UP_GOALS = 1_200
 _WARM_UP_LIMIT_S = 300.0
 _GROWTH_LIMIT_KB = 8 * 1024
-#: Reasons of goals that were lost with their engine.
-_LOST = frozenset({"engine_crashed", "engine_hung", "engine_failed", "not_silent"})
-#: Lines that a fault may add to the log, besides one for each goal.
+#: Reasons of goals that failed because of their engine.
+_ENGINE_REASONS = frozenset({"engine_crashed", "engine_hung", "engine_failed", "not_silent"})
+#: Log lines allowed per fault, in addition to one line per goal.
 _LOG_LINES_PER_FAULT = 6
 
 
 @dataclass(slots=True)
 class Report:
-    """Results of a soak."""
-
     ends: Counter[tuple[str, str | None]]  # by state and reason
     faults: Counter[str]
     heard_whole: int = 0  # sentences
@@ -50,7 +48,7 @@ class Report:
 
 
 class Soak:
-    """A server at a sink, with its clients and its witness."""
+    """A server with a sink, clients and a monitor."""
 
     def __init__(self, seed: int, player: str, stack: contextlib.ExitStack) -> None:
         self._seed, self._player = seed, player
@@ -59,40 +57,42 @@ class Soak:
         options = ("--player", player, "--max-queue", "20")
         self._talk = Talk(options, sink=self._sink, env={"TMPDIR": self._temporary}, watched=False)
         stack.callback(self._talk.close)
-        self._witness = stack.enter_context(contextlib.closing(Witness(self._talk.socket)))
+        self._monitor = stack.enter_context(contextlib.closing(GoalMonitor(self._talk.socket)))
 
-    def run(self, seconds: float, every: float | None, least: int) -> Report:
-        """Warm up, inject faults, and check what is left of them."""
-        talk, witness = self._talk, self._witness
+    def run(self, seconds: float, every: float | None, min_faults: int) -> Report:
+        """Warm up, inject faults, and check their effects."""
+        talk, monitor = self._talk, self._monitor
         senders = self._start_senders("warm-up")
-        assert witness.wait_for(_WARM_UP_GOALS, _WARM_UP_LIMIT_S), f"only {witness.ended} goals in the warm-up"
+        assert monitor.wait_for(_WARM_UP_GOALS, _WARM_UP_LIMIT_S), f"only {monitor.ended} goals in the warm-up"
         senders.stop()
         self._settle()
-        before, files, known = usage.count(talk.pid), self._files(), Counter(witness.ends)
-        report = self._disturb(seconds, every, least)
-        report.ends = witness.ends - known
-        lost = sum(count for (state, reason), count in report.ends.items() if state == "ABORTED" and reason in _LOST)
+        before, files, known = usage.count(talk.pid), self._files(), Counter(monitor.ends)
+        report = self._disturb(seconds, every, min_faults)
+        report.ends = monitor.ends - known
+        lost = sum(
+            count for (state, reason), count in report.ends.items() if state == "ABORTED" and reason in _ENGINE_REASONS
+        )
         assert every is not None or lost <= report.faults.total(), f"{report.faults} cost {lost} goals"
         self._settle()
         usage.assert_not_grown(talk.pid, before, memory=_GROWTH_LIMIT_KB)
-        left = self._files()
-        assert len(left) <= len(files), f"files are left: {left - files}"
-        lines, limit = talk.log.count("\n"), witness.ended + _LOG_LINES_PER_FAULT * report.faults.total() + 10
-        assert lines <= limit, f"{lines} lines in the log for {witness.ended} goals"
-        assert not witness.closed, f"the server let its watcher go: {talk.log[-2000:]}"
+        now = self._files()
+        assert len(now) <= len(files), f"files were left behind: {now - files}"
+        lines, limit = talk.log.count("\n"), monitor.ended + _LOG_LINES_PER_FAULT * report.faults.total() + 10
+        assert lines <= limit, f"{lines} lines in the log for {monitor.ended} goals"
+        assert not monitor.closed, f"the server closed the monitor's connection: {talk.log[-2000:]}"
         talk.stop()
         assert_no_bug(talk.log)
         return report
 
-    def _disturb(self, seconds: float, every: float | None, least: int) -> Report:
-        faults = Faults(self._talk, self._sink, self._player, random.Random(f"{self._seed} faults"))
+    def _disturb(self, seconds: float, every: float | None, min_faults: int) -> Report:
+        faults = RobotFaults(self._talk, self._sink, self._player, random.Random(f"{self._seed} faults"))
         clients = self._start_senders("")
         narrator = Narrator(self._talk, self._sink, faults.calm_since)
         clients.start("narrator", narrator.run)
         end = time.monotonic() + seconds
 
         def over() -> bool:
-            done = time.monotonic() >= end and faults.done.total() >= least
+            done = time.monotonic() >= end and faults.done.total() >= min_faults
             return done or bool(clients.failures) or not self._talk.running
 
         try:
@@ -101,44 +101,46 @@ class Soak:
             else:
                 faults.run(every, over)
         finally:
-            clients.stop(f"after {faults.done}, the last was {faults.last}")
+            clients.stop(f"after {faults.done}; last fault: {faults.last}")
         return Report(Counter(), faults.done, narrator.heard_whole, self._grown)
 
     def _start_senders(self, phase: str) -> Workers:
         workers = Workers()
         self._grown: Counter[tuple[str, str]] = Counter()
         for number in range(_CLIENTS + _GROWING_CLIENTS):
-            chance = random.Random(f"{self._seed} {phase} {number}")
+            rng = random.Random(f"{self._seed} {phase} {number}")
             send = partial(send_goals, self._talk)
             if number >= _CLIENTS:
                 send = partial(send_growing_texts, self._talk, self._grown)
-            workers.start(f"client {number}", partial(send, chance))
+            workers.start(f"client {number}", partial(send, rng))
         return workers
 
     def _settle(self) -> None:
-        """Wait until all goals have ended, and speak once more."""
+        """Cancel all goals, wait until they have ended, and speak once more."""
         assert self._talk.request("cancel")["ok"]
-        left = self._witness.wait_until_all_have_ended()
-        assert not left, f"goals without an end: {left}"
+        unfinished = self._monitor.wait_until_all_have_ended()
+        assert not unfinished, f"goals without an end: {unfinished}"
         with self._talk.connect() as wire:
             assert wire.request("say", text="all is well", rate=450, wait=True)["ok"]
             last = wire.receive_event("result", timeout=30)["goal"]
         assert last["state"] == "SUCCEEDED", last
-        assert not self._witness.faults, self._witness.faults
+        assert not self._monitor.faults, self._monitor.faults
 
     def _files(self) -> set[str]:
         directories = (self._talk.directory, self._temporary)
-        return {f"{at}/{name}" for each in directories for at, below, files in os.walk(each) for name in below + files}
+        return {
+            f"{path}/{name}" for top in directories for path, folders, files in os.walk(top) for name in folders + files
+        }
 
 
-def soak(seconds: float, seed: int, every: float | None = 5.0, player: str = "aplay", least: int = 0) -> Report:
-    """Run a soak.
+def soak(seconds: float, seed: int, every: float | None = 5.0, player: str = "aplay", min_faults: int = 0) -> Report:
+    """Run a soak test until the time is over and there were enough faults.
 
-    It takes longer if there were not `least` faults yet. If `every` is None, the only fault is a killed engine.
+    If `every` is None, the only fault is a killed engine.
     """
     print(f"seed {seed}", flush=True)
     with contextlib.ExitStack() as stack:
-        return Soak(seed, player, stack).run(seconds, every, least)
+        return Soak(seed, player, stack).run(seconds, every, min_faults)
 
 
 def assert_no_bug(*logs: str) -> None:
@@ -147,7 +149,7 @@ def assert_no_bug(*logs: str) -> None:
 
 
 def parser(every: float) -> argparse.ArgumentParser:
-    """Return a parser with the options of every soak."""
+    """Return a parser with the options of all soak tests."""
     result = argparse.ArgumentParser()
     result.add_argument("--seconds", type=float, default=1800)
     result.add_argument("--seed", type=int, default=int(time.time()))
@@ -156,11 +158,11 @@ def parser(every: float) -> argparse.ArgumentParser:
 
 
 def main() -> None:
-    options = parser(every=5.0)
-    options.add_argument("--kills", action="store_true", help="only kill the engine, again and again")
-    options.add_argument("--player", choices=("aplay", "pacat"), default="aplay")
-    asked = options.parse_args()
-    print(soak(asked.seconds, asked.seed, None if asked.kills else asked.every, asked.player))
+    arguments = parser(every=5.0)
+    arguments.add_argument("--kills", action="store_true", help="only kill the engine, up to twice per second")
+    arguments.add_argument("--player", choices=("aplay", "pacat"), default="aplay")
+    options = arguments.parse_args()
+    print(soak(options.seconds, options.seed, None if options.kills else options.every, options.player))
 
 
 if __name__ == "__main__":

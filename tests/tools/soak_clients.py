@@ -1,4 +1,4 @@
-"""The clients of the soaks: threads that work until they are told to stop."""
+"""The clients of the soak tests: threads that work until they are stopped."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from tests.support.processes import Talk
     from tests.support.sink import Sink
 
-#: Seconds in which every goal ends. Each fault may hold up the queue for some seconds.
+#: Time limit until a goal ends. Each fault may delay the queue by some seconds.
 PATIENCE_S = 120.0
 _RATE = 450
 _SENTENCES = (
@@ -30,11 +30,11 @@ _SENTENCES = (
     "please step back from the moving platform",
     "battery is at twenty percent and falling",
 )
-#: How much the sound may be shorter or longer than the reference, and the least result of `similarity`.
+#: Allowed difference in length from the reference, and the lowest allowed `similarity`.
 _LENGTH_TOLERANCE_S = 0.06
-ALIKE = 0.3
+MIN_SIMILARITY = 0.3
 _FRAME_SAMPLES = RATE // 100
-#: Precision of the times of a recording.
+#: Precision of a recording's times.
 _BLOCK_S = 0.01
 
 _TEXTS = ("obstacle ahead", "turning left at the next corner", "door three is open", "one two three four five six")
@@ -47,7 +47,7 @@ _OPTIONS: tuple[dict[str, Any], ...] = (
 
 
 class Workers:
-    """Threads that run until `stop`, and the failures in them."""
+    """Threads that run until `stop`, and their failures."""
 
     def __init__(self) -> None:
         self.failures: list[str] = []
@@ -55,64 +55,63 @@ class Workers:
         self._threads: list[threading.Thread] = []
 
     def start(self, name: str, work: Callable[[threading.Event], None]) -> None:
-        """Start a thread. `work` is called with the event that ends it."""
+        """Start a thread that calls `work` with an event. The work must end when the event is set."""
 
         def run() -> None:
             try:
                 work(self._over)
-            except Exception as error:  # noqa: BLE001 - reported in the thread of the soak
+            except Exception as error:  # noqa: BLE001 - reported by `stop`
                 self.failures.append(f"{name}: {type(error).__name__}: {error}")
 
         self._threads.append(threading.Thread(target=run, name=name))
         self._threads[-1].start()
 
-    def stop(self, told: str = "") -> None:
+    def stop(self, details: str = "") -> None:
         """Wait until all threads have ended, and raise an error if one has failed."""
         self._over.set()
         end = time.monotonic() + 2 * PATIENCE_S
-        for each in self._threads:
-            each.join(max(0.0, end - time.monotonic()))
-            if each.is_alive():
-                self.failures.append(f"{each.name} hangs")
-        assert not self.failures, f"{self.failures} {told}"
+        for thread in self._threads:
+            thread.join(max(0.0, end - time.monotonic()))
+            if thread.is_alive():
+                self.failures.append(f"{thread.name} hangs")
+        assert not self.failures, f"{self.failures} {details}"
 
 
-def send_goals(talk: Talk, chance: random.Random, over: threading.Event) -> None:
-    """Send, cancel and preempt random goals. Each must have one end, in time."""
+def send_goals(talk: Talk, rng: random.Random, over: threading.Event) -> None:
+    """Send, cancel and preempt random goals. Each must end in time."""
     while not over.is_set():
         with talk.connect() as wire:
-            for _ in range(chance.randrange(1, 20)):
+            for _ in range(rng.randrange(1, 20)):
                 if not over.is_set():
-                    _send_goal(talk, wire, chance, over)
+                    _send_goal(talk, wire, rng, over)
 
 
-def _send_goal(talk: Talk, wire: Wire, chance: random.Random, over: threading.Event) -> None:
-    waits = chance.random() < 0.8
-    goal = wire.request("say", text=chance.choice(_TEXTS), wait=waits, **chance.choice(_OPTIONS))["goal"]
+def _send_goal(talk: Talk, wire: Wire, rng: random.Random, over: threading.Event) -> None:
+    waits = rng.random() < 0.8
+    goal = wire.request("say", text=rng.choice(_TEXTS), wait=waits, **rng.choice(_OPTIONS))["goal"]
     assert goal["state"] in {"PENDING", "REJECTED"}, goal
-    over.wait(chance.random() * 0.3)
-    if chance.random() < 0.9:
+    over.wait(rng.random() * 0.3)
+    if rng.random() < 0.9:
         assert wire.request("cancel", ids=[goal["id"]])["ok"]
     if waits:
         try:
             result = wire.receive_event("result", timeout=PATIENCE_S)["goal"]
         except TimeoutError:
-            raise AssertionError(f"{goal} has not ended; the server: {talk.request('status')}") from None
+            raise AssertionError(f"{goal} has not ended; the server's status: {talk.request('status')}") from None
         assert result["id"] == goal["id"], result
 
 
 class Narrator:
-    """Says sentences before all others. A sentence that SUCCEEDED must have been heard whole."""
+    """Speaks sentences with a high priority. If a sentence SUCCEEDED, it must have been heard completely."""
 
     def __init__(self, talk: Talk, sink: Sink, calm_since: Callable[[float], bool]) -> None:
-        """`calm_since`: whether nothing has disturbed the sound since a monotonic time."""
+        """`calm_since` returns whether no fault has disturbed the sound since a monotonic time."""
         self._talk, self._sink, self._calm_since = talk, sink, calm_since
         self._references = {text: render([text], rate=_RATE)[0] for text in _SENTENCES}
         self.heard_whole = 0
         self.ends: Counter[str] = Counter()
 
     def run(self, over: threading.Event) -> None:
-        """Narrate until it is over."""
         while not over.wait(0.2):
             self._narrate(_SENTENCES[self.ends.total() % len(_SENTENCES)])
 
@@ -123,18 +122,18 @@ class Narrator:
         self.ends[goal["state"]] += 1
         if goal["state"] != "SUCCEEDED" or not self._calm_since(times["ACTIVE"]):
             return
-        # By the times of the server: this thread may be late, and the next sentence follows at once.
+        # Use the server's times, because this thread may be late, and the next sentence follows at once.
         samples = recording.between(times["ACTIVE"] - _BLOCK_S, times["SUCCEEDED"] + _BLOCK_S)
         heard, wanted = _seconds_of_sound(samples), _seconds_of_sound(self._references[text])
-        likeness = similarity(samples, self._references[text])
-        told = f"{goal['id']} SUCCEEDED, but {heard:.2f} of {wanted:.2f} s were heard, {likeness:.2f} alike"
-        assert abs(heard - wanted) <= _LENGTH_TOLERANCE_S, told
-        assert likeness >= ALIKE, told
+        found = similarity(samples, self._references[text])
+        details = f"{goal['id']} SUCCEEDED, but {heard:.2f} of {wanted:.2f} s were heard, similarity {found:.2f}"
+        assert abs(heard - wanted) <= _LENGTH_TOLERANCE_S, details
+        assert found >= MIN_SIMILARITY, details
         self.heard_whole += 1
 
 
 def _follow(wire: Wire) -> tuple[dict[str, float], Message]:
-    """Return the monotonic time of each state of a goal, and the goal at its end."""
+    """Return the monotonic time of each state of a goal, and the ended goal."""
     clock = time.monotonic() - time.time()
     times: dict[str, float] = {}
     while (message := wire.receive(PATIENCE_S)).get("event") != "result":
@@ -144,7 +143,7 @@ def _follow(wire: Wire) -> tuple[dict[str, float], Message]:
 
 
 def _seconds_of_sound(samples: Samples) -> float:
-    """Return the seconds that are loud, without the gaps of a player that ran dry on a busy machine."""
+    """Return the seconds of sound, without the gaps that occur if a player runs dry on a busy machine."""
     frames = np.abs(samples[: len(samples) // _FRAME_SAMPLES * _FRAME_SAMPLES].astype(np.int32))
     loud = np.count_nonzero(frames.reshape(-1, _FRAME_SAMPLES).max(axis=1) > LOUD)
     return float(loud) * _FRAME_SAMPLES / RATE

@@ -1,4 +1,4 @@
-"""The faults of the soak, each with the way back."""
+"""The faults of the soak test. Each fault also restores the normal state."""
 
 from __future__ import annotations
 
@@ -22,34 +22,34 @@ if TYPE_CHECKING:
     from tests.support.processes import Talk
     from tests.support.sink import Sink
 
-#: Seconds after which a disturbed sink plays and is recorded as before.
-_WARM_S = 3.0
+#: Time until a disturbed sink plays and is recorded normally again.
+_RECOVERY_S = 3.0
 _SIGNAL_LIMIT_S = 20.0
-#: Seconds between two kills of an engine process, and between a kill and another one during the restart.
-_KILL_EVERY_S, _KILL_AGAIN_S = (0.12, 5.0), (0.0, 0.08)
+#: Time between two kills of an engine process, and between a kill and another kill during the restart.
+_KILL_INTERVAL_S, _RESTART_KILL_S = (0.12, 5.0), (0.0, 0.08)
 
 
-class FaultsInTurn:
-    """Injects faults in the calling thread, each kind as often as the others."""
+class FaultInjector:
+    """Injects faults in the calling thread, all kinds equally often."""
 
-    def __init__(self, chance: random.Random) -> None:
-        self.chance = chance
+    def __init__(self, rng: random.Random) -> None:
+        self.rng = rng
         self.kinds: Mapping[str, Callable[[], object]] = {}
         self.done: Counter[str] = Counter()
         #: the last fault, for messages
         self.last = "none"
 
     def run(self, every: float, over: Callable[[], bool]) -> None:
-        """Inject a fault every so many seconds on average, until it is over."""
-        left: list[str] = []
+        """Inject a fault every `every` seconds on average, until `over` returns True."""
+        remaining: list[str] = []
         while True:
-            due = time.monotonic() + every * self.chance.uniform(0.5, 1.5)
+            due = time.monotonic() + every * self.rng.uniform(0.5, 1.5)
             while time.monotonic() < due:
                 time.sleep(0.1)
                 if over():
                     return
-            left = left or self.chance.sample([*self.kinds], len(self.kinds))
-            self.inject(left.pop())
+            remaining = remaining or self.rng.sample([*self.kinds], len(self.kinds))
+            self.inject(remaining.pop())
 
     def inject(self, kind: str) -> None:
         self.last = kind
@@ -57,14 +57,12 @@ class FaultsInTurn:
         self.done[kind] += 1
 
 
-class Faults(FaultsInTurn):
-    """The faults of a robot without a fleet."""
-
-    def __init__(self, talk: Talk, sink: Sink, player: str, chance: random.Random) -> None:
-        super().__init__(chance)
+class RobotFaults(FaultInjector):
+    def __init__(self, talk: Talk, sink: Sink, player: str, rng: random.Random) -> None:
+        super().__init__(rng)
         self._talk = talk
         self._disturbed_until = 0.0
-        self._hit = 0
+        self._last_pid = 0
         self.kinds = {
             "engine killed": lambda: self._signal("talkcli.engine", signal.SIGKILL),
             "engine segfaults": lambda: self._signal("talkcli.engine", signal.SIGSEGV),
@@ -77,7 +75,7 @@ class Faults(FaultsInTurn):
             "sound server killed": lambda: self._disturb(sink.kill_server, sink.start_server, 3),
             "paused": lambda: self._disturb(self._pause, lambda: self._request("resume"), 2),
             "everything cancelled": lambda: self._request("cancel"),
-            "server hung up": self._hang_up,
+            "SIGHUPs": self._send_hangups,
             "client killed": self._kill_client,
             "clients frozen": self._freeze_clients,
             "clients by the hundred": self._connect_by_the_hundred,
@@ -85,35 +83,35 @@ class Faults(FaultsInTurn):
         }
 
     def kill_engines(self, over: Callable[[], bool]) -> None:
-        """Kill engine processes only, also while they start."""
+        """Only kill engine processes, also while they start."""
         self._disturbed_until = float("inf")
         while not over():
-            time.sleep(self.chance.uniform(*_KILL_EVERY_S))
+            time.sleep(self.rng.uniform(*_KILL_INTERVAL_S))
             self.inject("engine killed")
-            for _ in range(self.chance.choice((0, 0, 1, 2))):
-                time.sleep(self.chance.uniform(*_KILL_AGAIN_S))
+            for _ in range(self.rng.choice((0, 0, 1, 2))):
+                time.sleep(self.rng.uniform(*_RESTART_KILL_S))
                 self.inject("engine killed")
 
     def calm_since(self, moment: float) -> bool:
-        """Whether a sentence that began at this monotonic time must have been heard whole."""
-        return self._disturbed_until + _WARM_S < moment
+        """Whether a sentence that started at this monotonic time must have been heard completely."""
+        return self._disturbed_until + _RECOVERY_S < moment
 
     def _signal(self, name: str, number: signal.Signals) -> None:
-        """Send a signal to the process of that name, as soon as there is one that was not signalled before."""
+        """Send a signal to a process with this name, as soon as one exists that didn't get the last signal."""
         end = time.monotonic() + _SIGNAL_LIMIT_S
         while time.monotonic() < end:
             for pid in descendants(self._talk.pid):
-                if name in command_line(pid) and pid != self._hit:
+                if name in command_line(pid) and pid != self._last_pid:
                     with contextlib.suppress(ProcessLookupError):
                         os.kill(pid, number)
-                        self._hit = pid
+                        self._last_pid = pid
                         return
-            time.sleep(0.001)  # nothing tells when a process is started
+            time.sleep(0.001)  # a new process sends no event
 
-    def _disturb(self, begin: Callable[[], object], end: Callable[[], object], most: float) -> None:
+    def _disturb(self, begin: Callable[[], object], end: Callable[[], object], max_seconds: float) -> None:
         self._disturbed_until = float("inf")
         begin()
-        time.sleep(self.chance.uniform(0.1, most))
+        time.sleep(self.rng.uniform(0.1, max_seconds))
         end()
         self._disturbed_until = time.monotonic()
 
@@ -124,20 +122,20 @@ class Faults(FaultsInTurn):
         reply = self._talk.request("pause")
         assert reply["ok"] or reply["error"]["code"] == "not_silent", reply  # a frozen engine doesn't confirm it
 
-    def _hang_up(self) -> None:
+    def _send_hangups(self) -> None:
         for _ in range(100):
             os.kill(self._talk.pid, signal.SIGHUP)
 
     def _kill_client(self) -> None:
         client = self._talk.start("say", "--wait", "--priority", "5", "--", "nobody waits for this any more")
-        time.sleep(self.chance.uniform(0.1, 0.5))
+        time.sleep(self.rng.uniform(0.1, 0.5))
         client.kill()
         client.wait()
 
     def _freeze_clients(self) -> None:
         with client_process(self._talk, 20, json.dumps({"seq": 1, "request": "watch"})) as clients:
             clients.send_signal(signal.SIGSTOP)
-            time.sleep(self.chance.uniform(0.5, 3))
+            time.sleep(self.rng.uniform(0.5, 3))
 
     def _connect_by_the_hundred(self) -> None:
         with contextlib.ExitStack() as stack:
@@ -145,6 +143,6 @@ class Faults(FaultsInTurn):
                 stack.enter_context(Raw(self._talk.socket))
 
     def _send_bad_lines(self) -> None:
-        for data in (self.chance.randbytes(3000), b"[" * 60_000 + b"\n", b"a" * 100_000, b'{"request": "say", "te'):
+        for data in (self.rng.randbytes(3000), b"[" * 60_000 + b"\n", b"a" * 100_000, b'{"request": "say", "te'):
             with Raw(self._talk.socket) as raw:
                 raw.send(data)

@@ -1,8 +1,8 @@
-"""Measure what it takes to ask a thousand robots at once.
+"""Measure requests to a thousand robots at once.
 
-Starts a mosquitto, simulated robots (real bridges and servers without sound) and a few real ones, asks all of them with
-the real command, and prints the median and the maximum of each measurement. With the default options it takes three
-minutes. A sentence that is spoken twice or late is an error.
+This program starts mosquitto, simulated robots (real bridges and servers without sound) and a few real robots. It sends
+requests to all of them with the real command, and prints the median and the maximum of each measurement. With the
+default options, it takes three minutes. A sentence that is spoken twice or too late is an error.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.fleet.broker import from_environment
 from talkcli.fleet.desk.watch import read_robots
-from tests.fleet.many import RealRobots, Roll, SimulatedRobots
+from tests.fleet.many import PresenceListener, RealRobots, SimulatedRobots
 from tests.support.bridge import Bridge, Desk
 from tests.support.broker import Broker
 from tests.support.mqtt import Listener
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
     from tests.support.processes import Finished, Process
 
-#: No log of every packet, and counts every second.
+#: Only log errors instead of all packets, and update the counts every second.
 _SETTINGS = ("log_type none", "log_type error", "sys_interval 1")
 _LIMIT_S = 60.0
-#: Seconds after which a command has no effects any more: a robot publishes its status once a second.
-_REST_S = 2.5
+#: Time after which a command has no effects any more. A robot publishes its status once per second.
+_SETTLE_S = 2.5
 _TTL_S = 10.0
-#: An environment in which processes are started rather than forked from one that the tests share.
-_STARTED = {"PYTHONHASHSEED": "0"}
+#: Environment that prevents forking, so that real processes are started.
+_NOT_FORKED = {"PYTHONHASHSEED": "0"}
 _COUNTS = {
     "messages to the broker": "$SYS/broker/publish/messages/received",
     "messages from the broker": "$SYS/broker/publish/messages/sent",
@@ -44,35 +44,35 @@ _COUNTS = {
 
 
 class MeasuredFleet:
-    """A broker, its robots, and a desk that asks all of them."""
+    """A broker, its robots, and a desk that sends requests to all of them."""
 
     def __init__(self, options: argparse.Namespace, stack: contextlib.ExitStack) -> None:
         self.rounds, self.idle_s = range(options.rounds), options.idle
         self._goals = 0
         self.broker = stack.enter_context(Broker(settings=_SETTINGS))
         self.simulated = stack.enter_context(SimulatedRobots(self.broker, options.robots, processes=4))
-        self.simulated.await_there(_LIMIT_S)
+        self.simulated.await_online(_LIMIT_S)
         self.real = stack.enter_context(RealRobots(self.broker, [f"real-{n + 1}" for n in range(options.real)]))
-        env = {"TALK_ROBOT": "@all", **_STARTED}
+        env = {"TALK_ROBOT": "@all", **_NOT_FORKED}
         self.desk = stack.enter_context(Desk(self.broker, user="desk", password=False, env=env))
         self.names = [*self.real.names, *self.simulated.names]
 
     def start_say(self, seconds: float, *options: str) -> tuple[str, Process]:
-        """Start a command that has all robots speak for so many seconds, and return the goal's id with it."""
+        """Start a command that makes all robots speak for some seconds. Return the goal's id and the process."""
         self._goals += 1
         goal = f"goal-{self._goals}"
         text = f"length={seconds:g} {goal}"
         return goal, self.desk.start("say", *options, "--id", goal, "--ttl", f"{_TTL_S:g}", "--", text)
 
     def say(self, seconds: float) -> float:
-        """Have all robots speak, check that each did so once and in time, and return the seconds of the command."""
-        began = time.monotonic()
+        """Make all robots speak, check that each spoke once and in time, and return the seconds of the command."""
+        started_at = time.monotonic()
         goal, process = self.start_say(seconds, "--wait")
         self.finish(process)
-        took = time.monotonic() - began
-        self.check(goal, began)
-        time.sleep(_REST_S)
-        return took
+        seconds = time.monotonic() - started_at
+        self.check(goal, started_at)
+        time.sleep(_SETTLE_S)
+        return seconds
 
     def finish(self, process: Process, code: int = 0) -> Finished:
         done = self.desk.finish(process, timeout=_LIMIT_S)
@@ -80,80 +80,80 @@ class MeasuredFleet:
         return done
 
     def await_spoken(self, goal: str) -> None:
-        self.real.each(lambda each: each.talk.watcher.wait_for(goal, "ACTIVE"))
+        self.real.each(lambda robot: robot.talk.watcher.wait_for(goal, "ACTIVE"))
         self.simulated.await_spoken(goal, _LIMIT_S)
 
-    def check(self, goal: str, began: float) -> None:
-        """Assert that each robot has begun a goal once and in time."""
-        late = self.simulated.assert_spoken_once(goal) - began
-        assert late < _TTL_S, f"{goal} was spoken {late:.1f} s after it was said"
+    def check(self, goal: str, sent_at: float) -> None:
+        """Assert that each robot has started a goal once and in time."""
+        delay = self.simulated.assert_spoken_once(goal) - sent_at
+        assert delay < _TTL_S, f"{goal} was spoken {delay:.1f} s after it was sent"
         for name, texts in self.real.spoken().items():
-            assert [each.endswith(goal) for each in texts].count(True) == 1, f"{name}: {texts}"
+            assert [text.endswith(goal) for text in texts].count(True) == 1, f"{name}: {texts}"
 
     def traffic(self, action: Callable[[], object]) -> dict[str, float]:
-        """Return what the broker has carried for each robot during an action."""
-        time.sleep(_REST_S)
+        """Return the broker's traffic per robot during an action."""
+        time.sleep(_SETTLE_S)
         before = self._counts()
         action()
         after = self._counts()
         return {name: (after[name] - before[name]) / len(self.names) for name in after}
 
     def _counts(self) -> dict[str, float]:
-        """Return the broker's counts, and the time at which it had just counted."""
+        """Return the broker's counts, and the time at which they were updated."""
         with Listener(self.broker, *_COUNTS.values()) as listener:
             first = next(iter(_COUNTS.values()))
-            kept = listener.await_message(lambda each: each.topic == first)
-            fresh = listener.await_message(lambda each: each.topic == first and each.arrived > kept.arrived + 0.1, 15)
-            time.sleep(0.1)  # the others come with it
-            values = {each.topic: float(each.text) for each in listener.messages}
-        return {name: values.get(topic, 0.0) for name, topic in _COUNTS.items()} | {"seconds": fresh.arrived}
+            old = listener.await_message(lambda message: message.topic == first)
+            new = listener.await_message(
+                lambda message: message.topic == first and message.arrived > old.arrived + 0.1, 15
+            )
+            time.sleep(0.1)  # the other counts come at the same time
+            values = {message.topic: float(message.text) for message in listener.messages}
+        return {name: values.get(topic, 0.0) for name, topic in _COUNTS.items()} | {"seconds": new.arrived}
 
 
 def measure_roster(fleet: MeasuredFleet) -> None:
     broker, times = from_environment(fleet.desk.env), []
     for _ in fleet.rounds:
-        began = time.monotonic()
+        started_at = time.monotonic()
         assert len(read_robots(broker, _LIMIT_S, with_status=False)) == len(fleet.names)
-        times.append(time.monotonic() - began)
+        times.append(time.monotonic() - started_at)
     _print("all robots, in a program", times)
     _print("`talk fleet status`", [fleet.desk.run("fleet", "status", timeout=_LIMIT_S).seconds for _ in fleet.rounds])
 
 
 def measure_idle(fleet: MeasuredFleet) -> None:
-    """Measure the traffic of robots that do nothing."""
-    found = fleet.traffic(lambda: time.sleep(fleet.idle_s))
+    traffic = fleet.traffic(lambda: time.sleep(fleet.idle_s))
     for name in _COUNTS:
-        _print(f"idle: {name} for each robot", [found[name] / found["seconds"] / len(fleet.names)], "/s")
+        _print(f"idle: {name} per robot", [traffic[name] / traffic["seconds"] / len(fleet.names)], "/s")
 
 
 def measure_sentence(fleet: MeasuredFleet) -> None:
-    """Measure the traffic of a sentence."""
-    found = fleet.traffic(lambda: fleet.say(1))
+    traffic = fleet.traffic(lambda: fleet.say(1))
     for name in list(_COUNTS)[:2]:
-        _print(f"a sentence: {name} for each robot", [found[name]], "")
+        _print(f"a sentence: {name} per robot", [traffic[name]], "")
 
 
 def measure_cancel(fleet: MeasuredFleet) -> None:
-    """Measure a cancel while all robots speak, without and with a desk that waits for their ends."""
+    """Measure a cancel while all robots speak, without and with a desk that waits for the ends."""
     for options, code, name in (((), 0, ""), (("--wait",), 7, ", while another desk waits for all ends")):
         times = []
         with Listener(fleet.broker, "talk/group/all/request/+") as listener:
             for _ in fleet.rounds:
-                said = time.monotonic()
+                said_at = time.monotonic()
                 goal, speaking = fleet.start_say(60, *options)
                 fleet.await_spoken(goal)
-                time.sleep(_REST_S)
-                began = time.monotonic()
+                time.sleep(_SETTLE_S)
+                cancelled_at = time.monotonic()
                 cancel = fleet.desk.start("cancel")
                 assert cancel.stdout
                 for _line in cancel.stdout:
                     last = time.monotonic()
                 fleet.finish(cancel)
-                sent = listener.await_message(lambda each, began=began: each.arrived > began)  # type: ignore[misc]
+                sent = listener.await_message(lambda message, start=cancelled_at: message.arrived > start)  # type: ignore[misc]
                 fleet.finish(speaking, code)
-                fleet.check(goal, said)
+                fleet.check(goal, said_at)
                 times.append(last - sent.arrived)
-                time.sleep(_REST_S)
+                time.sleep(_SETTLE_S)
         _print(f"`talk --robot @all cancel`: message → last acknowledgement{name}", times)
 
 
@@ -162,19 +162,19 @@ def measure_say(fleet: MeasuredFleet) -> None:
 
 
 def measure_broker(fleet: MeasuredFleet) -> None:
-    """Measure how soon all robots are back after the broker was killed while they spoke."""
-    began = time.monotonic()
+    """Measure the time until all robots are online after the broker was killed while they spoke."""
+    said_at = time.monotonic()
     goal, speaking = fleet.start_say(5, "--wait")
     fleet.await_spoken(goal)
     fleet.broker.kill()
-    time.sleep(1)  # so that all robots have tried in vain
+    time.sleep(1)  # so that all robots have tried to reconnect
     fleet.broker.start()
-    up = time.monotonic()
-    with Roll(fleet.broker) as roll:
-        _print("broker back → last robot back", [roll.await_there(fleet.names, _LIMIT_S) - up])
+    restarted_at = time.monotonic()
+    with PresenceListener(fleet.broker) as presences:
+        _print("broker restarted → last robot online", [presences.await_online(fleet.names, _LIMIT_S) - restarted_at])
     fleet.finish(speaking)
-    fleet.check(goal, began)
-    time.sleep(_REST_S)
+    fleet.check(goal, said_at)
+    time.sleep(_SETTLE_S)
     fleet.say(1)
 
 
@@ -184,7 +184,7 @@ def measure_memory(fleet: MeasuredFleet) -> None:
     _print("memory of a desk that waits for all", [megabytes(speaking.pid, "Pss")], "MB")
     fleet.finish(speaking)
     _print("memory of the broker", [megabytes(fleet.broker.pid, "Pss")], "MB")
-    with Bridge(fleet.real[fleet.real.names[0]].talk, fleet.broker, "measured", env=_STARTED) as bridge:
+    with Bridge(fleet.real[fleet.real.names[0]].talk, fleet.broker, "measured", env=_NOT_FORKED) as bridge:
         bridge.await_online()
         _print("memory of a bridge", [megabytes(bridge.pid, "Pss")], "MB")
         bridge.terminate()
@@ -210,10 +210,8 @@ def main() -> None:
     parser.add_argument("--robots", type=int, default=1000, help="simulated robots (%(default)s)")
     parser.add_argument("--real", type=int, default=3, help="real robots (%(default)s)")
     parser.add_argument("--rounds", type=int, default=5, help="repetitions of each measurement (%(default)s)")
-    parser.add_argument(
-        "--idle", type=float, default=60, metavar="SECONDS", help="time without a request (%(default)g)"
-    )
-    parser.add_argument("--only", action="append", choices=[*MEASUREMENTS], help="measure this only")
+    parser.add_argument("--idle", type=float, default=60, metavar="SECONDS", help="time without requests (%(default)g)")
+    parser.add_argument("--only", action="append", choices=[*MEASUREMENTS], help="only measure this")
     options = parser.parse_args()
     with contextlib.ExitStack() as stack:
         fleet = MeasuredFleet(options, stack)

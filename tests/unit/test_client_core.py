@@ -146,12 +146,12 @@ def test_a_waiting_request_fails_if_the_server_is_replaced_by_an_older_one(recon
     other = submit(reconnecting, Status(), on_failure=lambda _: None)
     greet(reconnecting)
     assert str(exchange.error) == "the server is 1.0 and can't take Markdown: restart it"
-    assert [each["seq"] for each in send_all(reconnecting)] == [other.number]
+    assert [message["seq"] for message in send_all(reconnecting)] == [other.number]
 
 
 def test_a_server_describes_itself_and_malformed_fields_count_as_missing() -> None:
-    told: JsonObject = {"boot": "4k7f", "pid": 7, "version": "1.0", "features": ["markdown"], "new": 1}
-    assert ServerInfo.read(told) == ServerInfo("4k7f", 7, "1.0", ("markdown",))
+    description: JsonObject = {"boot": "4k7f", "pid": 7, "version": "1.0", "features": ["markdown"], "new": 1}
+    assert ServerInfo.read(description) == ServerInfo("4k7f", 7, "1.0", ("markdown",))
     assert ServerInfo.read({"boot": 1, "pid": "x", "version": None, "features": "all"}) == ServerInfo()
 
 

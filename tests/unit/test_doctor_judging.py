@@ -149,7 +149,7 @@ def test_the_next_step_after_a_sentence_depends_on_the_earlier_checks() -> None:
     assert str(custom.next).startswith("test the player with")
     assert examine(HUNG, None, hangs=True).next == "restart it"
     assert str(examine(HUNG, None).next).startswith("run talk doctor again")
-    assert str(examine(STALLED, silent=True, server_pid=None).next).startswith("run talk doctor --silent there")
+    assert str(examine(STALLED, silent=True, server_pid=None).next).startswith("run 'talk doctor --silent' there")
 
 
 def test_a_server_is_to_be_examined_by_the_user_who_runs_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -334,7 +334,7 @@ def test_the_result_of_the_sentence_is_shown_with_the_next_step() -> None:
     played = SentenceResult(State.SUCCEEDED, duration=1.7, player="aplay", by_server=True)
     finding = sentence.judge_sentence(played, silent=False, device=None)
     assert finding.state == OK
-    assert finding.message.endswith("was played to its end through the server, aplay, 1.7 s")
+    assert finding.message.endswith("was played to the end through the server, aplay, 1.7 s")
     assert "a sentence was played without sound" in sentence.judge_sentence(played, silent=True, device=None).message
     for beginning in ("speech failed: ", "Talk aborted: ", ""):  # older servers send the second one
         message = f"{beginning}aplay: audio open error: Permission denied"
@@ -515,7 +515,7 @@ def test_a_missing_device_is_to_be_connected_or_passed_to_the_container() -> Non
     [
         ({"origins": ("a container",)}, "PULSE_SERVER"),
         ({"origins": ("a system service",)}, "--print-unit user"),
-        ({"uid": 0, "sudo_uid": 1000}, "run this without sudo"),
+        ({"uid": 0, "sudo_uid": 1000}, "run talk doctor without sudo"),
         ({"runtime_dir": None, "usual_runtime_dir": "/run/user/1000"}, "export XDG_RUNTIME_DIR=/run/user/1000"),
         ({}, "systemctl --user restart"),
     ],

@@ -177,7 +177,7 @@ def test_text_may_be_added_wherever_sentences_are_allowed_even_late(stale: bool)
     refused = decide(message, allow=("append", "cancel"))
     assert refusal_code(refused) == "not_allowed"
     assert isinstance(refused, Refusal)
-    assert "may not use say" in refused.error.message
+    assert "does not allow say requests" in refused.error.message
 
 
 def test_a_stale_sentence_is_refused_but_a_stale_cancel_is_accepted() -> None:

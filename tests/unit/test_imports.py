@@ -148,7 +148,7 @@ def test_every_module_belongs_to_a_layer() -> None:
 
 def test_the_developers_picture_shows_the_layers_in_order() -> None:
     _, _, below = (PACKAGE / "README.md").read_text(encoding="utf-8").partition("## The layers\n")
-    assert re.findall(r"^    (\w+) ", below.partition("\n## ")[0], re.MULTILINE) == LAYERS[::-1]
+    assert re.findall(r"^(\w+) {2,}", below.partition("\n## ")[0], re.MULTILINE) == LAYERS[::-1]
 
 
 def test_no_module_imports_a_layer_above_it_even_for_types() -> None:
@@ -370,7 +370,7 @@ def test_the_doctors_judgements_do_no_io() -> None:
 def test_contributing_names_every_file_that_handles_an_option() -> None:
     """The document's example is the option --ttl."""
     text = (PACKAGE.parent / ".github" / "CONTRIBUTING.md").read_text("utf-8")
-    steps = text.partition("**An option of `say`**")[2].partition("\n\nThe protocol, its checks")[0]
+    steps = text.partition("**An option of `say`**")[2].partition("\n\nThe row of an option is used by")[0]
     named = {module_name(PACKAGE / path) for path in re.findall(r"talkcli/([\w/]+\.py)", steps)}
     having = {module for module in sources() if re.search(r"\bttl\b", ast.unparse(sources()[module]))}
     # In a fleet, a ttl is also the expiry of a message. No other option is handled there.

@@ -1,4 +1,4 @@
-"""The documents' tables of reasons, events, errors, limits and exit codes are those of the code."""
+"""The tables of states, requests, events, errors, limits and exit codes in the documents match the code."""
 
 from __future__ import annotations
 
@@ -35,21 +35,21 @@ NUMERALS = {5: "five"}
 ERRORS, LIMITS = tables(WIRE.section("Errors and limits"))
 
 
-def test_states_and_replies_are_in_the_tables() -> None:
+def test_states_and_requests_are_documented() -> None:
     states = tables(WIRE.section("States"))[0]
     documented = {code_spans(row[0])[0]: (int(row[1]), row[3] == "yes") for row in states[1:]}
-    assert documented == {each.name: (int(each), each.terminal) for each in State}
-    answered = {each for row in tables(WIRE.section("Requests"))[1][1:] for each in code_spans(row[0])[:1]}
-    assert answered == set(REQUEST_TYPES)
+    assert documented == {state.name: (int(state), state.terminal) for state in State}
+    requests = {request for row in tables(WIRE.section("Requests"))[1][1:] for request in code_spans(row[0])[:1]}
+    assert requests == set(REQUEST_TYPES)
 
 
-def test_features_are_in_the_table() -> None:
+def test_documented_features_match_the_code() -> None:
     (table,) = [each for each in tables(WIRE.text) if each[0][0] == "feature"]
     assert [code_spans(row[0]) for row in table[1:]] == [[each] for each in FEATURES]
 
 
-def test_keys_and_error_codes_of_the_tables_are_those_of_the_code() -> None:
-    """`tests/golden` and the tests of each fault have the codes themselves."""
+def test_documented_keys_and_error_codes_match_the_code() -> None:
+    """`tests/golden` and the tests of the faults check which code a fault has."""
     assert first_column(tables(WIRE.section("The goal"))[0]) == list(Goal("", State.PENDING).to_json())
     codes = first_column(ERRORS)
     refused: list[type[errors.RequestRefused]] = [
@@ -57,24 +57,25 @@ def test_keys_and_error_codes_of_the_tables_are_those_of_the_code() -> None:
         errors.BadRequest,
         *errors.BadRequest.__subclasses__(),
     ]
-    assert {each.code for each in refused} <= set(codes)
-    sources = "".join(each.read_text(encoding="utf-8") for each in (ROOT / "talkcli").rglob("*.py"))
-    for each in (*codes, *first_column(tables(FLEET.section("What is refused"))[0])):
-        assert f'"{each}"' in sources, each
+    assert {error.code for error in refused} <= set(codes)
+    sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "talkcli").rglob("*.py"))
+    for code in (*codes, *first_column(tables(FLEET.section("What is refused"))[0])):
+        assert f'"{code}"' in sources, code
 
 
-def test_server_has_the_keys_of_the_text(scripted: Talk) -> None:
-    (listed,) = re.findall(r"^`server` has (.*?)\.$", WIRE.section("Requests"), re.MULTILINE | re.DOTALL)
+def test_keys_of_the_server_are_documented(scripted: Talk) -> None:
+    form = r"the object `server` has these keys: (.*?)\.$"
+    (listed,) = re.findall(form, WIRE.section("Requests"), re.MULTILINE | re.DOTALL)
     assert code_spans(listed) == list(scripted.request("status")["server"])
 
 
-def test_numbers_of_kept_goals_are_in_the_text() -> None:
+def test_numbers_of_kept_goals_are_documented() -> None:
     assert RECENT_GOALS == 10
     kept = f"{MAX_SPOKEN_GOALS:,} spoken goals, {MAX_RECALLED_GOALS:,} RECALLED ones and {MAX_REJECTED_GOALS} REJECTED"
     assert f"The server keeps the last {kept} ones." in WIRE.section("The goal")
 
 
-def test_limits_are_those_of_the_code() -> None:
+def test_documented_limits_match_the_code() -> None:
     limits = {row[0]: row[1] for row in LIMITS[1:]}
     assert limits["a request"].startswith(f"{MAX_LINE_BYTES:,} bytes")
     assert f"within {connection.FIRST_REQUEST_S:g} s" in limits["the first request"]
@@ -96,7 +97,7 @@ def test_limits_are_those_of_the_code() -> None:
     assert f"and {REQUEST_BYTES >> 10} KiB each)" in limits["waiting requests"]
 
 
-def test_limits_of_a_fleet_are_those_of_the_code() -> None:
+def test_documented_limits_of_a_fleet_match_the_code() -> None:
     needs_packages("paho")
     from talkcli.fleet import link
     from talkcli.fleet.bridge import main as bridge
@@ -117,38 +118,38 @@ def test_limits_of_a_fleet_are_those_of_the_code() -> None:
     assert limits["remembered ids"] == f"{policy.MAX_REMEMBERED_IDS:,}"
     assert f"past {bridge.SLOW_BROKER_BYTES // 1024} KiB" in limits["a slow broker"]
     assert f"past {bridge.STUCK_BROKER_BYTES // 2**20} MiB" in limits["a slow broker"]
-    section = FLEET.section("Topics")
-    assert f"1 to {topics.MAX_NAME_CHARS} of" in section
+    section = " ".join(FLEET.section("Topics").split())
+    assert f"1 to {topics.MAX_NAME_CHARS} characters" in section
     assert f"expires after {bridge.PRESENCE_EXPIRY_S} s, renewed every {bridge.PRESENCE_EVERY_S:g} s" in section
     assert f"expires after {publisher.EVENT_EXPIRY_S} s" in section
     assert f"more than {policy.STALE_AFTER_S:g} s ago" in " ".join(FLEET.section("What is refused").split())
 
 
-def test_places_are_those_of_the_code(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_documented_socket_paths_match_the_code(monkeypatch: pytest.MonkeyPatch) -> None:
     variables = {"XDG_RUNTIME_DIR": "/own/run", "TMPDIR": "/own/tmpdir", "TEMP": "/own/temp", "TMP": "/own/tmp"}
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setattr("sys.platform", "linux")
     (paragraph,) = re.findall(r"^\*\*Connecting\..*?\n\n", WIRE.text, re.MULTILINE | re.DOTALL)
-    places = [each for each in code_spans(paragraph) if each.endswith(".sock")]
+    sockets = [path for path in code_spans(paragraph) if path.endswith(".sock")]
     for name, value in variables.items():
-        places = [each.replace(f"${name}/", f"{value}/") for each in places]
-    assert [each.replace("UID", str(os.getuid())) for each in places] == paths.client_sockets(None)
+        sockets = [path.replace(f"${name}/", f"{value}/") for path in sockets]
+    assert [path.replace("UID", str(os.getuid())) for path in sockets] == paths.client_sockets(None)
 
 
-def test_events_are_in_the_table() -> None:
+def test_events_are_documented() -> None:
     table = {code_spans(row[0])[0]: set(code_spans(row[2])) for row in tables(WIRE.section("Events"))[0][1:]}
-    sent = {kind: set(each.__annotations__) for kind, each in events._EVENTS_BY_KIND.items() if kind != "snapshot"}
+    sent = {kind: set(event.__annotations__) for kind, event in events._EVENTS_BY_KIND.items() if kind != "snapshot"}
     assert set(table) == {*sent, "alive"}
     assert all(fields <= table[kind] for kind, fields in sent.items())
 
 
-def test_exit_codes_and_commands_are_in_the_readme() -> None:
+def test_exit_codes_and_commands_are_documented() -> None:
     rows = [row[0] for row in tables(README.section("Exit codes"))[0][1:]]
     assert rows[-1] == f"{errors.EXIT_SIGNAL}+n"
-    classes = [each for each in vars(errors).values() if isinstance(each, type) and issubclass(each, errors.TalkError)]
-    used = {each.exit_code for each in classes} | set(states.EXIT_CODES.values())
+    classes = [cls for cls in vars(errors).values() if isinstance(cls, type) and issubclass(cls, errors.TalkError)]
+    used = {error.exit_code for error in classes} | set(states.EXIT_CODES.values())
     used |= {errors.EXIT_OK, errors.EXIT_ERROR, errors.EXIT_USAGE, errors.EXIT_DIFFER, errors.EXIT_TIMEOUT}
     assert sorted(map(int, rows[:-1])) == sorted(used)
-    for each in commands.COMMANDS:
-        assert re.search(rf"\btalk (?:-\S+ |--robot \S+ )*{each}\b", README.text), each
+    for command in commands.COMMANDS:
+        assert re.search(rf"\btalk (?:-\S+ |--robot \S+ )*{command}\b", README.text), command

@@ -1,4 +1,4 @@
-"""The examples of the wire and of the library, run as they stand in the documents against a server."""
+"""The documents' examples for the protocol and the library, run with a server."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tests.support.connection import Message
     from tests.support.processes import Talk
 
-#: The robot of the README's loop: it stays blocked until the sentence has been heard.
+#: A robot for the README's loop. It is blocked until the goal has been spoken.
 ROBOT = """
 import time
 
@@ -53,8 +53,8 @@ print(*robot.lips)
 
 
 def only(document: Document, language: str, title: str | None, mark: str) -> str:
-    """Return the one example of a section, or of a whole document, that contains this mark."""
-    (found,) = [each for each in document.examples(language, title) if mark in each]
+    """Return the only example of a section or document that contains `mark`."""
+    (found,) = [example for example in document.examples(language, title) if mark in example]
     return found
 
 
@@ -64,7 +64,7 @@ def run(talk: Talk, *command: str) -> subprocess.CompletedProcess[str]:
     return done
 
 
-def test_line_of_socat_says_a_sentence(scripted: Talk) -> None:
+def test_a_goal_can_be_sent_with_socat(scripted: Talk) -> None:
     needs("socat")
     done = run(scripted, "sh", "-c", only(WIRE, "sh", None, "socat -t 5"))
     greeting, reply = map(json.loads, done.stdout.splitlines())
@@ -72,9 +72,9 @@ def test_line_of_socat_says_a_sentence(scripted: Talk) -> None:
     assert scripted.watcher.wait_for_terminal(reply["goal"]["id"]) == "SUCCEEDED"
 
 
-def test_conversation_about_a_growing_text(make_talk: MakeTalk) -> None:
+def test_the_conversation_about_a_growing_text(make_talk: MakeTalk) -> None:
     section = WIRE.section("Speak a text while it is written")
-    lines = re.findall(r"^    ([→←]) (.*)$", section, re.MULTILINE)
+    lines = re.findall(r"^([→←]) (.*)$", section, re.MULTILINE)
     assert len(lines) == 13
     unused: list[Message] = []
     with make_talk("--player", "null", "--rate", "450").connect() as client:
@@ -83,10 +83,10 @@ def test_conversation_about_a_growing_text(make_talk: MakeTalk) -> None:
             if arrow == "→":
                 client.send(message)
                 continue
-            while not (found := [each for each in unused if not differences(message, each)]):
+            while not (matches := [candidate for candidate in unused if not differences(message, candidate)]):
                 unused.append(client.receive())
-            unused.remove(found[0])
-    assert {each.get("event") for each in unused} == {"word"}
+            unused.remove(matches[0])
+    assert {message.get("event") for message in unused} == {"word"}
 
 
 @pytest.fixture
@@ -97,7 +97,7 @@ def shell_client(tmp_path: Path) -> str:
     return str(path)
 
 
-def test_client_in_shell(scripted: Talk, shell_client: str) -> None:
+def test_the_shell_client_reports_each_result(scripted: Talk, shell_client: str) -> None:
     ends = {
         'she said "go", \\o/ and\nleft': ("SUCCEEDED", 0),
         '"event": "result", "state": "ABORTED"': ("SUCCEEDED", 0),
@@ -107,14 +107,16 @@ def test_client_in_shell(scripted: Talk, shell_client: str) -> None:
     for text, (state, code) in ends.items():
         done = run(scripted, "sh", shell_client, text)
         assert (done.stdout, done.returncode) == (f"{state}\n", code)
-    told = [each["goal"]["text"] for each in scripted.watcher.events() if each.get("state") in ("PENDING", "REJECTED")]
-    assert told == [each.replace("\n", " ") for each in ends]
+    spoken = [
+        event["goal"]["text"] for event in scripted.watcher.events() if event.get("state") in ("PENDING", "REJECTED")
+    ]
+    assert spoken == [text.replace("\n", " ") for text in ends]
     scripted.stop()
     done = run(scripted, "sh", shell_client, "battery low")
     assert (done.stdout, done.returncode) == ("no result\n", 1)
 
 
-def test_client_in_shell_cancels_on_ctrl_c(scripted: Talk, shell_client: str) -> None:
+def test_the_shell_client_cancels_its_goal_on_ctrl_c(scripted: Talk, shell_client: str) -> None:
     with subprocess.Popen(["sh", shell_client, "never-ends"], env=scripted.env, start_new_session=True) as client:
         goal = scripted.watcher.wait_for(None, "ACTIVE")["id"]
         os.killpg(client.pid, signal.SIGINT)
@@ -122,28 +124,28 @@ def test_client_in_shell_cancels_on_ctrl_c(scripted: Talk, shell_client: str) ->
     assert scripted.watcher.wait_for_terminal(goal) == "PREEMPTED"
 
 
-def test_client_in_plain_python(scripted: Talk) -> None:
+def test_the_plain_python_client_prints_the_words(scripted: Talk) -> None:
     example = only(WIRE, "python", "Two clients", "socket")
     assert "talkcli" not in example
     done = run(scripted, sys.executable, "-c", example)
     assert done.returncode == 0, done
-    *told, last = done.stdout.splitlines()
+    *words, last = done.stdout.splitlines()
     assert last == "SUCCEEDED Talk completed successfully"
-    assert [each.split()[1] for each in told] == ["battery", "low,", "going", "home"]
-    times = [float(each.split()[0]) for each in told]
+    assert [line.split()[1] for line in words] == ["battery", "low,", "going", "home"]
+    times = [float(line.split()[0]) for line in words]
     assert times == sorted(times)
     refused = run(scripted, sys.executable, "-c", example.replace('"feedback": True', '"melody": True'))
     assert (refused.returncode, refused.stdout) == (1, "")
     assert "melody" in refused.stderr
 
 
-def test_first_example_of_the_library(scripted: Talk) -> None:
+def test_the_first_example_of_the_library_prints_the_words(scripted: Talk) -> None:
     done = run(scripted, sys.executable, "-c", only(README, "python", "Use it from Python", "battery low"))
     assert done.returncode == 0, done
-    assert [each.split(": ")[1] for each in done.stdout.splitlines()] == ["follow", "me", "to", "the", "charger"]
+    assert [line.split(": ")[1] for line in done.stdout.splitlines()] == ["follow", "me", "to", "the", "charger"]
 
 
-def test_loop_of_a_robot(scripted: Talk) -> None:
+def test_the_loop_of_a_robot_speaks(scripted: Talk) -> None:
     example = only(README, "python", "Use it from Python", "robot.drives")
     done = run(scripted, sys.executable, "-c", ROBOT.format(example=example))
     assert (done.returncode, done.stdout, done.stderr) == (0, "please let me pass\n", "")
@@ -155,12 +157,12 @@ def test_loop_of_a_robot(scripted: Talk) -> None:
         ("self.blocked = False", 'raise SystemExit("the goal failed")', "", "PREEMPTED"),
         ("os.kill({pid}, signal.SIGKILL)", 'self.blocked, self.lips = False, ["lights"]', "lights", None),
     ],
-    ids=["nobody is in the way any more", "the server is killed"],
+    ids=["way is free", "server is killed"],
 )
-def test_loop_of_a_robot_whose_goal_is_cut_short(
+def test_the_loop_of_a_robot_handles_an_aborted_goal(
     scripted: Talk, on_word: str, lights: str, shown: str, state: str | None
 ) -> None:
-    """The loop cancels a goal that has become needless, and flashes the lights if the goal is lost."""
+    """The loop cancels a goal that is no longer needed, and flashes the lights if the goal is lost."""
     example = only(README, "python", "Use it from Python", "robot.drives").replace("please let me pass", "never-ends")
     robot = ROBOT.replace("self.lips.append(word)", on_word.format(pid=scripted.pid))
     robot = robot.replace('raise SystemExit("nobody heard it")', lights)

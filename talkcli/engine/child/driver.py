@@ -43,13 +43,16 @@ class CannotStart(Exception):
     """
 
     def __init__(self, message: str, reason: Reason = Reason.ENGINE_FAILED, **more: bool) -> None:
-        """Create the error and its `StartFailed` message. `more` contains further fields of the message."""
+        """Create the error and its `StartFailed` message.
+
+        `more` contains further fields of the message.
+        """
         super().__init__(message)
         self.failure = protocol.StartFailed(reason, message, **more)
 
 
 def start(configure: protocol.Configure, runner: GoalRunner) -> protocol.Ready:
-    """Start pyttsx3's engine, attach it to the runner, and return the `Ready` message for the server.
+    """Start pyttsx3's engine, and attach it to the runner.
 
     Raises:
         CannotStart: a driver, a voice or a library is missing or unknown.
@@ -76,7 +79,7 @@ def start(configure: protocol.Configure, runner: GoalRunner) -> protocol.Ready:
 
 
 def _register_own_driver(synthesizer_name: str, driver_name: str, runner: GoalRunner) -> CombinedSynthesizer:
-    """Create one of `talk`'s synthesizers, register a driver for it, and return the synthesizer.
+    """Create one of `talk`'s synthesizers, and register a driver for it.
 
     Raises:
         CannotStart: a library or the default voice is missing.
@@ -94,14 +97,14 @@ def _register_own_driver(synthesizer_name: str, driver_name: str, runner: GoalRu
 
 
 def register_driver(name: str, synthesizer: Synthesizer, runner: GoalRunner) -> None:
-    """Register a driver for this synthesizer, so that `pyttsx3.init(name)` finds it."""
+    """Register a pyttsx3 driver for this synthesizer."""
     module: Any = types.ModuleType(f"pyttsx3.drivers.{name}")
     module.buildDriver = lambda proxy: Driver(proxy, synthesizer, runner)
     sys.modules[module.__name__] = module
 
 
 def _start_engine(pyttsx3: Any, name: str, *, user_chosen: bool) -> Any:
-    """Initialize pyttsx3 with a driver, start its event loop, and return its engine.
+    """Start a pyttsx3 engine with this driver.
 
     If the user has chosen the driver, a wrong name is a usage error.
 
@@ -119,7 +122,7 @@ def _start_engine(pyttsx3: Any, name: str, *, user_chosen: bool) -> Any:
         raise CannotStart(_start_error_message(name, error), permanent=False) from error
     try:
         engine.startLoop(False)
-        engine.iterate()  # a driver that fails here would otherwise hang at the first goal
+        engine.iterate()  # otherwise, a faulty driver would hang at the first goal
     except TypeError as error:
         message = f'the driver "{name}" cannot be used (its iterate() is not a generator); leave out --driver'
         raise CannotStart(message, usage_error=True) from error
@@ -141,7 +144,7 @@ def _available_drivers() -> list[str]:
 
 
 def _make_run_loop_step(driver_name: str) -> Callable[[], None]:
-    """Return a function that runs macOS's event loop once, or does nothing if the driver doesn't need it."""
+    """Return a function that runs macOS's event loop once, if the driver needs it."""
     if sys.platform != "darwin" or driver_name not in _RUN_LOOP_DRIVERS:
         return lambda: None
     from Foundation import NSDate, NSRunLoop  # type: ignore[import-not-found,unused-ignore]
@@ -168,7 +171,9 @@ class DriverProperties:
         engine.connect("error", self._record_error)
 
     def apply(self, command: protocol.Speak) -> str | None:
-        """Set the properties for a goal. Return the reason if another voice had to be used, otherwise None.
+        """Set the properties for a goal.
+
+        Return the reason if another voice had to be used, otherwise None.
 
         A neural voice may have disappeared since the goal was accepted. The driver then falls back to another of its
         voices, preferably in the same language. It doesn't do so if `voice_only` is set.
@@ -198,7 +203,7 @@ class DriverProperties:
         return fallback_reason
 
     def set_voice(self, wanted: str | None) -> None:
-        """Set the voice that best matches a name, or the driver's default voice if `wanted` is None.
+        """Set the voice that best matches a name, or the default voice.
 
         Raises:
             CannotSpeak: there is no such voice.
@@ -219,8 +224,8 @@ class DriverProperties:
         """
         found = voices.find_voice(wanted, self._voices)
         if found is not None and is_neural(found.id) and without_speaker(wanted) != without_speaker(found.id):
-            found = None  # not an exact match, and a voice installed since then may match better
-        if found is None:  # listing the voices takes some milliseconds, so it is only done if necessary
+            found = None  # the match isn't exact, and a voice that was installed later may match better
+        if found is None:  # listing the voices takes some milliseconds
             self._voices = voices.list_voices(self._engine)
             found = voices.find_voice(wanted, self._voices)
         if found is None:
@@ -229,9 +234,10 @@ class DriverProperties:
         return found.id
 
     def _set_property(self, name: str, value: Any, setting: str) -> None:
-        """Set a property of the engine. In error messages, `setting` names the property and its value.
+        """Set a property of the engine, or raise CannotSpeak.
 
-        pyttsx3 reports errors through notifications. This method raises them as exceptions.
+        pyttsx3 reports errors through notifications. This method raises them as exceptions. In the messages,
+        `setting` names the property and its value.
 
         Raises:
             CannotSpeak: the property can't be set.
@@ -247,12 +253,12 @@ class DriverProperties:
             raise CannotSpeak(Reason.BAD_OPTION, f"the driver {self._driver} cannot set {setting}: {why}") from error
 
     def _record_error(self, exception: Exception, **_: object) -> None:
-        """Store an error that pyttsx3 reports, so that `_set_property` can raise it."""
+        """Store an error from pyttsx3 for `_set_property` to raise."""
         self._error = exception
 
 
 class Driver:
-    """`talk`'s own pyttsx3 driver, which plays the sound that a synthesizer produces.
+    """A pyttsx3 driver that plays the sound of a synthesizer.
 
     pyttsx3's DriverProxy calls the methods. One step of `iterate` speaks a whole sentence: the synthesizer writes to
     the playback, which waits for the player. An exception must not leave this step, because pyttsx3 would drop the
@@ -271,10 +277,10 @@ class Driver:
         self._playback: Playback | None = None
 
     def iterate(self) -> Iterator[None]:
-        """Speak each stored text, and yield whenever there is none. Never return."""
+        """Speak each stored text, and yield whenever there is none."""
         while True:
             if self._text is None:
-                self._proxy.setBusy(False)  # each driver is busy at first, and gets no text while it is busy
+                self._proxy.setBusy(False)  # pyttsx3 sends no text while the driver is busy
             if self._text is None:
                 yield
                 continue
@@ -282,7 +288,7 @@ class Driver:
             self._speak(text)
 
     def say(self, text: str) -> None:
-        """Store a text, which the next step of `iterate` speaks, and tell pyttsx3 that the driver is busy."""
+        """Store a text to be spoken by the next step of `iterate`."""
         self._proxy.setBusy(True)
         self._text = text
 
@@ -296,7 +302,7 @@ class Driver:
     destroy = stop
 
     def getProperty(self, name: str) -> Any:  # noqa: N802 - pyttsx3's name
-        """Return the list of voices, the ID of the current voice, or the value of a speech setting.
+        """Return the value of a property.
 
         Raises:
             KeyError: the property is unknown.
@@ -309,7 +315,9 @@ class Driver:
         return self._synthesizer.voice if name == "voice" else fields(self._sound)[name]
 
     def setProperty(self, name: str, value: Any) -> None:  # noqa: N802 - pyttsx3's name
-        """Load a voice if the property is "voice". Otherwise, change a setting for the next sentences.
+        """Load a voice if the property is "voice".
+
+        Otherwise, change a setting for the next sentences.
 
         Raises:
             KeyError: the property is unknown.
@@ -322,7 +330,7 @@ class Driver:
             self._sound = replace(self._sound, **{name: kind(value)})
 
     def _speak(self, text: str) -> None:
-        """Speak a text to its end, store the results in the runner, and notify pyttsx3 of each step."""
+        """Speak a text, and notify pyttsx3 of each step."""
         runner = self._runner
         self._proxy.notify("started-utterance")
         self._playback = playback = Playback(runner, self._notify_word)
@@ -366,6 +374,6 @@ class Driver:
                 playback.await_text(min(growing.due(now, buffered), now + buffered if buffered > 0 else NEVER))
 
     def _notify_word(self, word: TimedWord) -> None:
-        """Notify pyttsx3 that a word is being heard, and store its position in the audio in the runner."""
+        """Notify pyttsx3 that a word is being heard."""
         self._runner.position = word.position
         self._proxy.notify("started-word", location=word.location, length=word.length)

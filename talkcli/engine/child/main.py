@@ -76,7 +76,9 @@ def _die_with_parent() -> None:
 
 
 def _limit_core_dump() -> None:
-    """Prevent core dumps if a text crashes the library. A dump takes longer than a restart, and wears out SD cards.
+    """Prevent core dumps if a text crashes the library.
+
+    A dump takes longer than a restart, and wears out SD cards.
 
     The limit is one byte. With a limit of 0, the kernel would still pipe the core to a program that collects cores.
     """
@@ -85,9 +87,9 @@ def _limit_core_dump() -> None:
 
 
 def _limit_memory() -> None:
-    """Limit this process to half of the machine's memory, because a voice model may request any amount.
+    """Limit this process to half of the machine's memory.
 
-    With the limit, the library reports an error. Without it, the machine would stall until the kernel kills a process.
+    If a voice model needs more, the library reports an error. Without the limit, the machine would stall.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     limit = max(_MIN_MEMORY_BYTES, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2)

@@ -1,4 +1,4 @@
-"""Playback of one sentence, including pauses and a check that all of it was heard.
+"""Playback of one sentence, including pauses.
 
 `Playback` waits only in `GoalRunner.wait`, so that a `Stop` or a `Hold` can arrive at any time. `SentenceSamples` and
 `PlayerFeed` never wait. Nothing here depends on how the samples are synthesized or which kind of player plays them.
@@ -46,8 +46,8 @@ EARLY_END_LIMIT_S = 0.25
 DEVICE_BUSY_LIMIT_S = 1.0
 DEVICE_RETRY_INTERVAL_S = 0.05
 
-#: Maximum length of the zero samples to skip at the beginning of a sentence. libespeak-ng produces 0 to 11 ms of zeros.
-#: Longer silence is intentional, for example at volume 0.
+#: Maximum duration of the zero samples to skip at the beginning of a sentence. libespeak-ng produces 0 to 11 ms of
+#: zeros. Longer silence is intentional, for example at volume 0.
 LEADING_ZEROS_LIMIT_S = 0.1
 
 #: Time allowed for a killed player to exit. It usually takes 1 ms, unless the player hangs in a device driver.
@@ -60,8 +60,8 @@ HOLD_SILENCE_LIMIT_S = 0.15
 #: How far the word clock may run ahead of the sound. Measurements show 4 to 8 ms.
 CLOCK_ERROR_S = 0.01
 
-#: If samples are late, the resulting silence counts as a gap only if it is longer than this. A shorter silence is
-#: inaudible, and the clock can't measure it precisely.
+#: The minimum length of a gap caused by late samples. A shorter silence is inaudible, and the clock can't measure it
+#: precisely.
 INAUDIBLE_GAP_S = 0.05
 
 #: How much sound to repeat after a player was killed with sound in its buffer. The clock isn't exact, so some sound
@@ -104,7 +104,7 @@ class SentenceSamples:
         return self.begin + len(self._kept)
 
     def add(self, samples: bytes) -> None:
-        """Add samples at the end, and update what is known about sound and silence in the sentence."""
+        """Append samples to the buffer."""
         self._kept += samples
         self.audible = self.audible or samples.count(0) != len(samples)
         backwards = reversed(array("h", samples))
@@ -112,11 +112,14 @@ class SentenceSamples:
         self._quiet = self._quiet + len(samples) if quiet_count is None else quiet_count * SAMPLE_BYTES
 
     def leading_zeros(self) -> int:
-        """Return the length in bytes of the zero samples at the beginning of the buffer."""
+        """Return how many bytes of zeros the buffer begins with."""
         return (len(self._kept) - len(self._kept.lstrip(b"\0"))) // SAMPLE_BYTES * SAMPLE_BYTES
 
     def part(self, begin: int, end: int) -> memoryview:
-        """Return a view of the samples between two offsets. Release it before adding or dropping samples."""
+        """Return a view of the samples between two offsets.
+
+        Release it before adding or dropping samples.
+        """
         return memoryview(self._kept)[begin - self.begin : end - self.begin]
 
     def drop_until(self, offset: int) -> None:
@@ -125,15 +128,15 @@ class SentenceSamples:
         self.begin = offset
 
     def trailing_silence(self, limit: int) -> int:
-        """Return the length in bytes of the silence at the end of the buffer, at most `limit`."""
+        """Return how many bytes of silence the buffer ends with, at most `limit`."""
         return min(self._quiet, limit, len(self._kept))
 
 
 class PlayerFeed:
-    """Sends samples to one player, and adjusts the clock for word reports to the player's progress."""
+    """Sends samples to one player, and keeps the word clock in step with it."""
 
     def __init__(self, player: Player, rate: int, clock: WordClock, begin: float, lead_in: float) -> None:
-        """Start a stream, and reset the clock for it.
+        """Start a stream, and reset the word clock.
 
         Args:
             player: the player, which was just opened.
@@ -145,23 +148,26 @@ class PlayerFeed:
         self.player = player
         #: maximum number of bytes to offer at once
         self.piece_bytes = int(PIECE_S * rate) * SAMPLE_BYTES
-        #: number of bytes that the player had consumed at the last update, including silence
+        #: number of bytes consumed at the last update, including silence
         self.consumed = 0
         #: number of bytes written to the player, including silence
         self.written = 0
-        #: time at which the player last accepted samples or had consumed everything
+        #: time at which the player last made progress
         self.progress_at = time.monotonic()
         self._rate = rate
         self._clock = clock
         self._first_write_at = 0.0
         #: time at which everything written will have been heard
         self._heard_at = 0.0
-        #: number of bytes of silence still to be written before the first sample
+        #: bytes of silence to write before the first sample
         self.lead_in = int(lead_in * rate) * SAMPLE_BYTES if player.real_time else 0
         clock.reset(begin)
 
     def offer(self, samples: memoryview) -> int:
-        """Offer samples to the player, and return the number of bytes accepted. The first ones start the clock."""
+        """Offer samples to the player, and return the number of bytes accepted.
+
+        The first samples start the clock.
+        """
         taken = self.player.offer(samples)
         if taken:
             now = time.monotonic()
@@ -174,7 +180,7 @@ class PlayerFeed:
         return taken
 
     def offer_silence(self, position: float, limit: int | None = None) -> int:
-        """Offer silence to the player, record it in the clock, and return the number of bytes accepted.
+        """Offer silence to the player, and return the number of bytes accepted.
 
         Args:
             position: position in the audio of the next sample.
@@ -186,10 +192,13 @@ class PlayerFeed:
         return taken
 
     def update(self, now: float, *, complete: bool) -> None:
-        """Adjust the clock to the player's progress. Set `complete` if nothing more will be written."""
+        """Adjust the clock to the player's progress.
+
+        Set `complete` if nothing more will be written.
+        """
         consumed = self.player.consumed()
         if consumed > self.consumed:
-            if self.consumed == 0:  # the device has been opened; until then, samples wait in the player's pipe
+            if self.consumed == 0:  # until the device is open, samples wait in the player's pipe
                 self._clock.start(now)
             self.consumed = consumed
             if consumed >= self.written:  # consuming a few bytes now and then doesn't count as progress
@@ -205,7 +214,7 @@ class PlayerFeed:
         return max(0.0, self.time_left(self.written, now))
 
     def time_left(self, byte_count: int, now: float) -> float:
-        """Return the seconds until this many bytes of the stream have been heard.
+        """Return the seconds until the first `byte_count` bytes have been heard.
 
         The result is negative if they have already been heard.
         """
@@ -227,11 +236,14 @@ class PlayerFeed:
 
 
 class _PlayerReleased(Exception):
-    """Raised if the player was released during a pause. After the pause, a new player repeats the current step."""
+    """Raised if the player was released during a pause.
+
+    After the pause, a new player repeats the current step.
+    """
 
 
 class Playback:
-    """Plays one sentence, using the samples that a synthesizer writes to it.
+    """Plays one sentence from the samples of a synthesizer.
 
     All public methods except `stop` and `silence` may raise Stopped or CannotSpeak.
     """
@@ -252,7 +264,7 @@ class Playback:
         self._feed: PlayerFeed | None = None
         self._first_error: CannotSpeak | None = None
         self._clock = WordClock()
-        #: all samples so far; once the player is known to work, only those not heard yet
+        #: the samples; once the player is known to work, only those not heard yet
         self._samples = SentenceSamples()
         self._complete = False  # whether all samples were written
         self._begin = 0  # offset of the current player's first sample
@@ -264,7 +276,7 @@ class Playback:
         self._skipped = 0
         #: monotonic time at which to stop retrying a busy device; 0 if no device was busy
         self._busy_until = 0.0
-        #: whether the samples are synthesized in another thread, and may be late
+        #: whether another thread synthesizes the samples, so that they may be late
         self._in_background = False
         #: whether the player may have run dry because the text was missing, which doesn't count as a gap
         self._text_was_missing = False
@@ -282,7 +294,7 @@ class Playback:
     # -- methods for the synthesizer
 
     def begin(self, rate: int, voice: str, fallback_reason: str | None = None) -> None:
-        """Set the sample rate, report the voice to the server, and start a player unless the goal is paused.
+        """Set the sample rate, and start a player unless the goal is paused.
 
         The player starts in 1 to 15 ms, while the synthesizer produces the first samples. `write` raises its errors.
 
@@ -325,7 +337,7 @@ class Playback:
             self._with_player(self._send_all)
 
     def wait(self, descriptor: int) -> None:
-        """Keep playing until the descriptor is ready, while another thread synthesizes more samples.
+        """Keep playing until the descriptor is ready.
 
         This method may return early. If the player runs out of samples in the meantime, it doesn't count as stalled.
         """
@@ -361,7 +373,7 @@ class Playback:
         self._wait(until=until)
 
     def finish(self) -> float:
-        """Play the sentence to its end, report its remaining words, and return its length in seconds.
+        """Play the sentence to its end, and return its length in seconds.
 
         If any part of the sentence wasn't heard, this method raises CannotSpeak.
         """
@@ -417,9 +429,11 @@ class Playback:
     # -- choosing a player
 
     def _with_player(self, step: Callable[[PlayerFeed], None]) -> None:
-        """Call `step` with the current player. If that player fails or was released, repeat it with the next.
+        """Call `step` with the current player.
 
-        It is repeated if the player fails before any sound was heard, or if the player was released during a pause.
+        If the player fails or was released, call `step` with the next player.
+
+        The call is repeated if the player fails before any sound was heard, or was released during a pause.
         """
         while True:
             self._raise_if_stopped()
@@ -437,7 +451,7 @@ class Playback:
                 self._handle_player_error(error)
 
     def _open_next_player(self) -> PlayerFeed:
-        """Open the next candidate player, and return a feed that begins with the first unheard sample."""
+        """Open the next player, and return a feed that starts at the first unheard sample."""
         self._untried = self._untried or self._players.candidates(self._rate)
         player = next(self._untried)()
         self._sent = self._begin
@@ -446,7 +460,7 @@ class Playback:
         return PlayerFeed(player, self._rate, self._clock, self._seconds(self._begin), lead_in)
 
     def _handle_player_error(self, error: CannotSpeak) -> None:
-        """Release a failed player so that the next can be tried, or raise an error if none can replace it.
+        """Release a failed player, or raise an error if no other can replace it.
 
         There is no replacement if some of the sound may have been heard, or if no other player is left.
         """
@@ -469,27 +483,39 @@ class Playback:
             self._wait(until=time.monotonic() + DEVICE_RETRY_INTERVAL_S)
 
     def _may_retry_busy_device(self, error: CannotSpeak) -> bool:
-        """Return whether the device is busy and may be tried again. The first call starts the time limit."""
+        """Return whether the device is busy and may be tried again.
+
+        The first call starts the time limit.
+        """
         if error.reason != Reason.AUDIO_DEVICE or "busy" not in str(error).lower():
             return False
         self._busy_until = self._busy_until or time.monotonic() + DEVICE_BUSY_LIMIT_S
         return time.monotonic() < self._busy_until
 
     def _release_player(self, next_begin: int) -> None:
-        """Kill the player, and start over with the best one. It continues at the offset `next_begin`."""
+        """Kill the player.
+
+        The best player then continues the sentence at the offset `next_begin`.
+        """
         self._begin = self._sent = next_begin
         self._untried = self._first_error = None
         self.silence()
 
     def _release_and_rewind(self, feed: PlayerFeed) -> None:
-        """Release a player that still has sound in its buffer. The next player repeats the unheard sound."""
+        """Release a player that still has sound in its buffer.
+
+        The next player repeats the unheard sound.
+        """
         feed.update(time.monotonic(), complete=False)
         self._release_player(self._unheard_begin() if feed.player.proven else self._begin)
 
     # -- steps
 
     def _send_all(self, feed: PlayerFeed) -> None:
-        """Send the player all samples up to `_sendable_end`. Play silence while the sentence is paused."""
+        """Send the player all samples up to `_sendable_end`.
+
+        Play silence while the sentence is paused.
+        """
         if feed.written == 0:
             feed.progress_at = time.monotonic()  # until now, the player had nothing to play
         while True:
@@ -509,7 +535,7 @@ class Playback:
                 raise CannotSpeak(Reason.AUDIO_STALLED, f"{feed.player.name} accepted no sound for {limit:g} s")
 
     def _await_samples(self, feed: PlayerFeed, more: Sequence[Interest] = (), until: float = NEVER) -> None:
-        """Keep playing until a descriptor in `more` is ready, the time is reached or the player needs attention."""
+        """Keep playing until a descriptor in `more` is ready, time is up or the player needs attention."""
         if self._runner.hold_number:
             self._keep_silent(feed)
         feed.player.ended()  # check for a failure here, because the wait below doesn't report it
@@ -520,7 +546,7 @@ class Playback:
         feed.progress_at = time.monotonic()  # until now, the player had nothing to play
 
     def _drain(self, feed: PlayerFeed) -> None:
-        """Send the remaining samples, and wait until the player has played them and ended."""
+        """Send the remaining samples, and wait until the player has finished."""
         self._send_all(feed)
         player = feed.player
         player.close()
@@ -529,7 +555,7 @@ class Playback:
         while not player.ended():
             self._update_progress(feed)
             now = time.monotonic()
-            # If less sound is left, it isn't worth killing the player, because it will finish anyway.
+            # If less sound is left, let the player finish.
             if self._runner.hold_number and feed.buffered(now) > HOLD_SILENCE_LIMIT_S:
                 self._release_and_rewind(feed)
                 raise _PlayerReleased
@@ -544,7 +570,9 @@ class Playback:
     # -- samples
 
     def _skip_leading_zeros(self) -> bool:
-        """Decide how many zero samples at the beginning to skip. Return False if it is too early to decide.
+        """Decide how many leading zero samples to skip.
+
+        Return False if it is too early to decide.
 
         Zeros before the first sound are skipped, so that it is heard earlier. They are kept in a file. They are also
         kept after another sentence, because they are part of the silence between the two sentences.
@@ -563,7 +591,7 @@ class Playback:
         return True
 
     def _offer_next(self, feed: PlayerFeed) -> int:
-        """Offer the next samples or the lead-in silence to the player, and return the number of bytes accepted."""
+        """Offer the next samples to the player, and return the number of bytes accepted."""
         if feed.lead_in:
             taken = feed.offer_silence(self._seconds(self._begin), feed.lead_in)
             feed.lead_in -= taken
@@ -595,7 +623,7 @@ class Playback:
         return max(self._sent, self._samples.end - self._samples.trailing_silence(limit))
 
     def _update_progress(self, feed: PlayerFeed) -> None:
-        """Adjust the clock, report the words that have started, and drop the samples that were heard."""
+        """Adjust the clock to the player's progress, and report the words that have started."""
         now = time.monotonic()
         sent_all = self._complete and self._sent == self._sendable_end(feed)
         feed.update(now, complete=sent_all and not self._runner.hold_number)
@@ -653,7 +681,10 @@ class Playback:
         feed.progress_at = time.monotonic()
 
     def _await_silence(self, feed: PlayerFeed) -> None:
-        """Wait until the player has played its buffer or the sentence continues. Replace a player that is too slow."""
+        """Wait until the player has played its buffer or the sentence continues.
+
+        Replace a player that is too slow.
+        """
         self._update_progress(feed)
         written, now = feed.written, time.monotonic()
         deadline = now + HOLD_SILENCE_LIMIT_S
@@ -668,7 +699,7 @@ class Playback:
             now = time.monotonic()
 
     def _offer_silence(self, feed: PlayerFeed) -> int:
-        """Offer silence to the player, unless it already has enough, and return the number of bytes accepted.
+        """Offer silence to the player unless it has enough, and return the number of bytes accepted.
 
         Without this limit, some players would accept silence endlessly.
         """
@@ -684,7 +715,10 @@ class Playback:
     # -- waiting
 
     def _wait_for_continue(self) -> None:
-        """Confirm the pause, and wait without a player until the sentence continues."""
+        """Confirm the pause, and wait until the sentence continues.
+
+        There is no player meanwhile.
+        """
         while self._runner.hold_number:
             self._runner.confirm_hold()
             self._wait()
@@ -692,7 +726,7 @@ class Playback:
     def _wait_for_player(
         self, feed: PlayerFeed, until: float, more: Sequence[Interest] = (), *, has_samples: bool = True
     ) -> None:
-        """Wait until the player needs attention, a word is due or a time limit is reached.
+        """Wait until the player needs attention, a word is due or time is up.
 
         Args:
             feed: the stream of the player.
@@ -712,7 +746,10 @@ class Playback:
         self._wait([*interests, *more], until)
 
     def _wait(self, interests: Sequence[Interest] = (), until: float = NEVER) -> None:
-        """Let the runner wait and execute commands. If the sentence has been stopped, raise Stopped."""
+        """Let the runner wait and execute commands.
+
+        If the sentence has been stopped, raise Stopped.
+        """
         self._runner.wait(interests, until)
         self._raise_if_stopped()
 

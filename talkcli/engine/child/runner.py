@@ -1,4 +1,4 @@
-"""The main loop of the engine process, which speaks goals through pyttsx3 and executes commands.
+"""The main loop of the engine process, which speaks goals and executes commands.
 
 The loop runs in one thread. While `talk`'s own driver speaks, it waits in `GoalRunner.wait`, which executes a `Stop` or
 `Hold` at once. Third-party drivers can't pause a sentence. They are stopped instead, and later speak the rest of the
@@ -73,7 +73,10 @@ class Channel:
             self.closed = True
 
     def receive(self) -> list[protocol.Command]:
-        """Wait for data, and return the commands that have arrived completely. At the end, set `closed`."""
+        """Wait for data, and return all complete commands.
+
+        If the server has closed the connection, set `closed`.
+        """
         try:
             data = os.read(self.descriptor, 65536)
         except ConnectionResetError:
@@ -99,7 +102,7 @@ class ActiveGoal:
         self.words = WordFinder(self.text)
         #: time at which the driver last received text
         self.resumed_at = now
-        #: seconds of speech before that, if a third-party driver was paused
+        #: seconds of speech before `resumed_at`, if a third-party driver was paused
         self.spoken_s = 0.0
         #: time at which the driver last received text or reported a word
         self.progress_at = now
@@ -121,7 +124,7 @@ class ActiveGoal:
         self.confirmed_hold = 0
         #: the first error that the driver reported
         self.error: Exception | None = None
-        #: whether a log message has reported that the driver takes too long
+        #: whether the log already says that the driver takes too long
         self.overdue_logged = False
 
     def append(self, command: protocol.Append, now: float) -> None:
@@ -145,7 +148,10 @@ class ActiveGoal:
 
 
 class GoalRunner:
-    """Executes the server's commands, and speaks its goals. Call `attach_engine` once, and then `run`."""
+    """Executes the server's commands, and speaks its goals.
+
+    Call `attach_engine` once, and then `run`.
+    """
 
     def __init__(self, channel: Channel, players: PlayerChooser) -> None:
         """Create a runner without an engine.
@@ -180,7 +186,7 @@ class GoalRunner:
         pump: Callable[[], None] | None,
         synthesizer: CombinedSynthesizer | None,
     ) -> None:
-        """Set the pyttsx3 engine that speaks the goals, and subscribe to its notifications.
+        """Set the pyttsx3 engine that speaks the goals.
 
         Args:
             engine: pyttsx3's engine.
@@ -198,7 +204,7 @@ class GoalRunner:
         engine.connect("error", _with_traceback(self._record_error))
 
     def run(self, *, send_voices: bool) -> None:
-        """Speak goals and execute other commands until the server has closed the connection.
+        """Speak goals and execute commands until the server disconnects.
 
         Args:
             send_voices: whether to send the list of voices first.
@@ -217,7 +223,9 @@ class GoalRunner:
                 self._speak(self._goal)
 
     def wait(self, interests: Iterable[Interest] = (), until: float = NEVER) -> None:
-        """Wait for a descriptor, a command or a time limit. Execute arriving commands, and send events that are due.
+        """Wait for a descriptor, a command or a time limit.
+
+        Execute arriving commands, and send events that are due.
 
         This method may return early. By then, a command may have stopped or paused the sentence.
 
@@ -244,7 +252,7 @@ class GoalRunner:
             self._channel.send(protocol.Alive(self._goal.id if self._goal else ""))
 
     def _execute(self, command: protocol.Command) -> None:
-        """Execute a command. A command for a goal that has already ended is ignored."""
+        """Execute a command, unless its goal has already ended."""
         goal = self._goal
         if isinstance(command, protocol.LoadVoice | protocol.DropVoice):
             if self._synthesizer is not None:
@@ -273,7 +281,7 @@ class GoalRunner:
             self._engine.stop()
 
     def _stop_goal(self) -> None:
-        """Stop the driver or, if it isn't speaking the current goal, end the goal at once."""
+        """Stop the current goal."""
         if self._goal is not None and not self._goal.stop_requested:
             self._goal.stop_requested = True
             if self._goal.with_driver:
@@ -282,7 +290,7 @@ class GoalRunner:
                 self._end_goal(protocol.OUTCOME_STOPPED)
 
     def _send_voice_events(self) -> None:
-        """Send the server the latest events about the loading and memory of neural voices."""
+        """Send the server the latest events about neural voices."""
         loader = self._synthesizer.loader if self._synthesizer else None
         for event in loader.take_events() if loader else ():
             self._channel.send(event)
@@ -307,7 +315,10 @@ class GoalRunner:
             self._channel.send(protocol.TextMissing(goal.id, missing))
 
     def confirm_hold(self) -> None:
-        """Confirm to the server that the paused goal is silent. Each pause is confirmed only once."""
+        """Confirm to the server that the paused goal is silent.
+
+        Each pause is confirmed only once.
+        """
         goal = self._goal
         if goal is not None and not goal.stop_requested and goal.confirmed_hold != self.hold_number:
             goal.confirmed_hold = self.hold_number
@@ -323,14 +334,14 @@ class GoalRunner:
     # -- one goal
 
     def _begin_goal(self, command: protocol.Speak) -> None:
-        """Make this the current goal, which `run` speaks next, and tell the server that it has started."""
+        """Make this the current goal, and tell the server that it has started."""
         self._goal = ActiveGoal(command, time.monotonic())
         self.hold_number, self.duration, self.heard, self.gaps = 0, None, None, []
         self.players.begin(command)
         self._channel.send(protocol.Started(command.id))
 
     def _speak(self, goal: ActiveGoal) -> None:
-        """Set the engine's properties for a goal, and speak the goal until it has ended."""
+        """Speak a goal until it has ended."""
         try:
             goal.fallback_reason = self._set_properties(goal.command)
         except CannotSpeak as error:
@@ -360,7 +371,7 @@ class GoalRunner:
             self._fail_goal(Reason.NOTHING_TO_SAY, "nothing in the text can be spoken")
 
     def _step_driver(self, goal: ActiveGoal) -> None:
-        """Run one step of the driver, and fail the goal if the driver has dropped or rejected the text.
+        """Run one step of the driver, and fail the goal if the driver has dropped its text.
 
         `talk`'s own driver speaks the whole text in one step. A third-party driver needs many steps.
         """
@@ -378,7 +389,7 @@ class GoalRunner:
             self._pump()
 
     def _report_word(self, location: int, length: int, **_: object) -> None:
-        """Send the server the word that starts at a location in the text, unless it was sent before.
+        """Report the word at a location in the text, unless it was already reported.
 
         The notification's `name` is not compared with the goal's ID, because some drivers set it to the word.
         """
@@ -398,7 +409,7 @@ class GoalRunner:
             self._goal.error = exception
 
     def _handle_driver_finished(self, name: str | None, completed: bool, **_: object) -> None:
-        """End the current goal after the driver has finished its text, unless it was interrupted by a pause."""
+        """End the current goal after the driver has finished its text."""
         goal = self._goal
         if goal is None or name != goal.id:  # the notification is for an earlier goal
             return
@@ -434,7 +445,7 @@ class GoalRunner:
         self._channel.send(ended)
 
     def _alive_due(self) -> float:
-        """Return the time at which to send the next `Alive`, or NEVER if none is due or the driver hangs."""
+        """Return when to send the next `Alive`, or NEVER if the process is idle or the driver hangs."""
         loader = self._synthesizer.loader if self._synthesizer else None
         loading = loader is not None and loader.descriptor is not None
         if not loading and (self._goal is None or self._notice_overdue(self._goal)):
@@ -442,7 +453,9 @@ class GoalRunner:
         return self._channel.sent_at + protocol.ALIVE_INTERVAL_S
 
     def _notice_overdue(self, goal: ActiveGoal) -> bool:
-        """Return whether a third-party driver has taken longer than the text can need, and log it once.
+        """Return whether a third-party driver takes too long for the text.
+
+        Log this once for each goal.
 
         The process then sends no `Alive`, so that the server kills it. There may be no other way to stop the driver.
         """
@@ -475,7 +488,7 @@ def _growing_text(beginning: str, command: protocol.Speak) -> GrowingText:
 
 
 def _with_traceback(callback: Callable[..., None]) -> Callable[..., None]:
-    """Wrap a callback so that an exception prints its traceback, because pyttsx3 drops exceptions silently."""
+    """Wrap a callback so that exceptions print a traceback."""
 
     def call(**values: Any) -> None:
         try:

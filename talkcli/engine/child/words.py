@@ -1,4 +1,4 @@
-"""Finds the words of a sentence in the text, and determines when each of them is heard.
+"""Finds the words of a sentence, and determines when each of them is heard.
 
 Nothing here reads the clock. All times are arguments, in monotonic seconds.
 """
@@ -21,7 +21,7 @@ _END_MARKS = ".,;:!?…"
 
 
 def count_letters(text: str, start: int) -> int:
-    """Count the letters, digits and combining accents from `start` to the first other character.
+    """Count the letters, digits and combining accents that begin at `start`.
 
     It is used as the length of a word if libespeak-ng reports a length of 0. libespeak-ng does so if the next character
     isn't ASCII (as in "«hello»"), and also if there is no word at all.
@@ -33,7 +33,7 @@ def count_letters(text: str, start: int) -> int:
 
 
 class WordFinder:
-    """Finds whole words in a text, given the locations that a synthesizer reports.
+    """Finds whole words in a text from the locations that a synthesizer reports.
 
     Synthesizers repeat locations, go back, report blanks, return lengths that extend into the next word, and report
     only the first part of "it's". `find` returns each word at most once, in the order of the text. If two words are
@@ -50,7 +50,7 @@ class WordFinder:
         self._text += text
 
     def find(self, location: int, length: int) -> tuple[int, int, int] | None:
-        """Return the start, end and number of the word at a reported location, or None if no new word starts there.
+        """Return the word at a reported location, or None if no new word starts there.
 
         The first word has number 1.
         """
@@ -71,7 +71,7 @@ class WordFinder:
         return start, self._end, self._count
 
     def _whole_end(self, start: int, end: int) -> int:
-        """Return the end of a whole word, given the start and end of its reported part."""
+        """Return the end of a word, given the reported part of it."""
         text = self._text
         if end == len(text) or text[end].isspace():
             return start + len(text[start:end].rstrip(_END_MARKS) or text[start:end])
@@ -113,11 +113,11 @@ class WordClock:
         self._waiting.append(word)
 
     def skip_until(self, position: float) -> None:
-        """Move all words before this position to it, because the audio before it is skipped."""
+        """Move all earlier words to this position."""
         self._waiting = deque(replace(each, position=max(position, each.position)) for each in self._waiting)
 
     def reset(self, position: float) -> None:
-        """Stop the clock, and prepare it for a new stream that begins at this position in the audio."""
+        """Stop the clock, and prepare it for a stream that begins at this position."""
         self._begin = position
         self._started_at = None
         self._silences.clear()
@@ -127,13 +127,19 @@ class WordClock:
         self._started_at = now
 
     def add_silence(self, position: float, seconds: float) -> None:
-        """Record silence in the stream before this position in the audio. Positions must not decrease."""
+        """Record silence in the stream before this position in the audio.
+
+        Positions must not decrease.
+        """
         if self._silences and self._silences[-1][0] == position:
             seconds += self._silences.pop()[1]
         self._silences.append((position, seconds))
 
     def set_elapsed(self, now: float, elapsed: float) -> None:
-        """Set the number of seconds heard, as reported by the output. A value of 0 stops the clock."""
+        """Set the number of seconds heard, as reported by the output.
+
+        A value of 0 stops the clock.
+        """
         self._started_at = now - elapsed if elapsed > 0 else None
 
     def limit_elapsed(self, now: float, elapsed: float) -> None:
@@ -155,7 +161,7 @@ class WordClock:
         return position
 
     def next_word_at(self) -> float:
-        """Return the time at which the next word starts, or infinity if no word is left or the clock is stopped."""
+        """Return the time at which the next word starts, or infinity if there is none."""
         if self._started_at is None or not self._waiting:
             return float("inf")
         position = self._waiting[0].position

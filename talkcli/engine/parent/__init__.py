@@ -1,1 +1,1 @@
-"""The engine thread of the server, which starts, monitors and replaces the engine process and sends goals to it."""
+"""The engine thread of the server, which manages the engine process."""

@@ -44,7 +44,7 @@ MAX_STDERR_LINE_BYTES = 1000
 
 
 def engine_command() -> list[str]:
-    """Return the command that starts an engine process with this process's interpreter and import path."""
+    """Return the command line that starts an engine process."""
     code = f"import sys; sys.path[:] = {sys.path!r}; from talkcli.engine.child.main import main; main()"
     return [sys.executable, "-c", code]
 
@@ -113,7 +113,9 @@ class EngineProcess:
     def receive(self) -> Iterator[protocol.Event | None]:
         """Yield the events that have arrived, without blocking.
 
-        The last event is None if the process has closed the connection or sent a malformed message.
+        The last one is None if the connection has ended.
+
+        A malformed message counts as the end of the connection.
         """
         try:
             data = self.socket.recv(65536)
@@ -133,7 +135,7 @@ class EngineProcess:
             yield event
 
     def read_stderr(self) -> bool:
-        """Read the process's standard error, pass on complete lines, and return whether it is still open."""
+        """Read the process's standard error, and return whether it is still open."""
         try:
             data = os.read(self.stderr, 65536)
         except BlockingIOError:
@@ -163,7 +165,7 @@ class EngineProcess:
             kill_holders(self.liveness)
 
     def describe_exit(self) -> str:
-        """Wait briefly for the process to exit, kill it, and return a description of how it exited."""
+        """End the process, and describe how it exited."""
         wait_ready({self.liveness: select.POLLIN}, _EXIT_WAIT_S)  # macOS doesn't report a closed end without POLLIN
         self.kill()  # must happen before the process is reaped, because its group ID may be reused afterwards
         try:
@@ -234,13 +236,16 @@ class PrivateEngine(contextlib.AbstractContextManager["PrivateEngine"]):
         self.events = self._receive_events()
 
     def __exit__(self, *_: object) -> None:
-        """Kill the process and wait until it has exited, so that it can't write to its output file any more."""
+        """Kill the process, and wait until it has exited."""
         self._process.kill()
         wait_ready({self._process.liveness: select.POLLIN}, KILL_LIMIT_S)
         self._process.close()
 
     def speak(self, command: protocol.GoalCommand) -> None:
-        """Tell the process to speak a text. It must be ready, and must have finished the previous text."""
+        """Tell the process to speak a text.
+
+        It must be ready, and must have finished the previous text.
+        """
         self._last_event_at = time.monotonic()
         self._process.send(command)  # if this fails, `wait_for` raises an error
 
@@ -255,7 +260,10 @@ class PrivateEngine(contextlib.AbstractContextManager["PrivateEngine"]):
         return next(event for event in self.events if isinstance(event, event_class))
 
     def _receive_events(self) -> Iterator[protocol.Event]:
-        """Yield the events of the process endlessly. Raise an error if it fails or a time limit has passed."""
+        """Yield the events of the process endlessly.
+
+        Raise an error if it fails or a time limit has passed.
+        """
         process = self._process
         watched = {process.socket.fileno(): select.POLLIN, process.stderr: select.POLLIN}
         while True:

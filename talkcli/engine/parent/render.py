@@ -49,7 +49,10 @@ _BLANK = re.compile(r"\s+")
 
 
 class RenderFailed(TalkError):
-    """The text was not rendered, and no file was created. `code` is a goal's reason or "cannot_write"."""
+    """The text was not rendered, and no file was created.
+
+    `code` is a goal's reason or "cannot_write".
+    """
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -124,12 +127,12 @@ def render(
             raise TimeoutError("the text was not rendered in time") from None
         except CannotWrite as error:
             if output_fd is not None and path in STANDARD_OUTPUT and wait_ready({output_fd: 0}, 0.0):
-                raise BrokenPipeError(errno.EPIPE, "the reader of standard output has closed it") from error
+                raise BrokenPipeError(errno.EPIPE, "the program that reads standard output has closed it") from error
             raise
 
 
 def split_into_pieces(text: str) -> Iterator[str]:
-    """Cut a text into pieces of at most `MAX_PIECE_CHARS`, at the end of a sentence or a word if possible."""
+    """Split a text into pieces, at the end of a sentence or a word if possible."""
     start = 0
     while len(text) - start > MAX_PIECE_CHARS:
         limit = start + MAX_PIECE_CHARS
@@ -172,7 +175,10 @@ def _speak_all(engine: PrivateEngine, commands: Iterator[protocol.Speak], engine
 
 
 def _convert_engine_error(error: EngineFailed, voice: str | None) -> RenderFailed:
-    """Convert an EngineFailed to a RenderFailed. `voice` is the voice that was speaking, or None."""
+    """Convert an EngineFailed to a RenderFailed.
+
+    `voice` is the voice that was speaking, or None.
+    """
     while_speaking = "" if voice is None else f' while it spoke with the voice "{voice}"'
     if error.reason == Reason.ENGINE_CRASHED:
         return RenderFailed(error.reason, f"the engine crashed{while_speaking}: {error}")
@@ -180,7 +186,10 @@ def _convert_engine_error(error: EngineFailed, voice: str | None) -> RenderFaile
 
 
 def _convert_goal_error(ended: protocol.Ended, engine_path: str, path: str) -> RenderFailed:
-    """Convert the unsuccessful end of a goal to an exception that names the user's file."""
+    """Return an exception for a goal that failed or was stopped.
+
+    Its message names the user's file.
+    """
     reason = ended.reason or Reason.ENGINE_FAILED
     message = (ended.message or "the engine stopped before the end of the text").replace(engine_path, path)
     if reason in _FILE_REASONS:
@@ -195,7 +204,7 @@ def _convert_os_error(path: str, error: OSError) -> CannotWrite:
 
 
 def _display_name(path: str) -> str:
-    """Return the path for messages, or "standard output" if the path stands for it."""
+    """Return the name of the output for messages."""
     return "standard output" if path in STANDARD_OUTPUT else path
 
 
@@ -215,7 +224,10 @@ def _is_stream(path: str) -> bool:
 
 @contextlib.contextmanager
 def _open_output(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> Iterator[int]:
-    """Open standard output, a pipe or a device in a `with` block, and yield its descriptor. Refuse a terminal."""
+    """Open standard output, a pipe or a device in a `with` block.
+
+    Refuse a terminal.
+    """
     output_fd = os.dup(1) if path in STANDARD_OUTPUT else _open_pipe_or_device(path, deadline, interrupt)
     try:
         if os.isatty(output_fd):
@@ -229,7 +241,10 @@ def _open_output(path: str, deadline: float, interrupt: Mapping[int, int] | None
 
 
 def _open_pipe_or_device(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> int:
-    """Open a device or a named pipe for writing. Wait until a named pipe has a reader."""
+    """Open a device or a named pipe, and return its descriptor.
+
+    Wait until a named pipe has a reader.
+    """
     while True:
         try:
             return os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
@@ -247,7 +262,10 @@ def _open_pipe_or_device(path: str, deadline: float, interrupt: Mapping[int, int
 
 @contextlib.contextmanager
 def _hidden_file(path: str) -> Iterator[str]:
-    """Create a hidden file, yield its path, and finally rename the file to `path`. After an error, remove it."""
+    """Create a hidden file that finally replaces the file at `path`.
+
+    After an error, remove it.
+    """
     target = _resolve_target(path)
     # The hidden name isn't derived from the target's name, because a longer name may exceed the file system's limit.
     hidden = os.path.join(os.path.dirname(target), f".talk-{os.urandom(8).hex()}.wav")
@@ -274,7 +292,9 @@ def _hidden_file(path: str) -> Iterator[str]:
 
 
 def _resolve_target(path: str) -> str:
-    """Return the path of the file to replace, with symbolic links resolved. Refuse a path that can't be replaced.
+    """Return the path of the file to replace, with symbolic links resolved.
+
+    Refuse a path that can't be replaced.
 
     Raises:
         CannotWrite: the path can't be replaced with a file.

@@ -1,4 +1,4 @@
-"""The engine thread, which owns the engine process, gives it one goal at a time, and enforces time limits.
+"""The engine thread, which gives the engine process one goal at a time.
 
 Another thread submits the goals. Whatever the engine process does, the engine thread posts exactly one `Ended` for each
 goal, unless the goal was abandoned. It reports everything through the callback `post` and holds no lock while it waits.
@@ -33,7 +33,7 @@ RESTART_DELAYS_S = (0.0, 0.1, 0.5, 2.0, 10.0)
 #: because a third-party driver may write a line for each word.
 MAX_STDERR_LINES = 20
 STDERR_PERIOD_S = 60.0
-#: If a process exits sooner than this without having had a goal, the next start may be delayed.
+#: If a process exits sooner than this without a goal, the next start may be delayed.
 MIN_LIFETIME_S = 1.0
 #: If no process has been ready for this long, each failed start also fails a goal. Otherwise, goals would wait forever.
 ENGINE_WAIT_LIMIT_S = 10.0
@@ -48,14 +48,20 @@ class EngineDied:
 
 @frozen
 class EngineMissing:
-    """The engine has failed to start for a long time. The next goal fails with this message."""
+    """The engine has failed to start for a long time.
+
+    The next goal fails with this message.
+    """
 
     message: str
 
 
 @frozen
 class EngineSaid:
-    """A line from the engine process's standard error, for the log. It may contain parts of a goal's text."""
+    """A line from the engine process's standard error, for the log.
+
+    It may contain parts of a goal's text.
+    """
 
     line: str
 
@@ -134,7 +140,9 @@ class RestartPolicy:
             self._back_off(now)
 
     def start_failed(self, now: float, started_at: float, permanent_error: str | None) -> bool:
-        """Schedule the next start after a failed one. Return whether goals have waited too long.
+        """Schedule the next start after a failed one.
+
+        Return whether goals have waited too long.
 
         Args:
             now: the current time.
@@ -153,7 +161,10 @@ class RestartPolicy:
 
 @dataclass(slots=True, eq=False)
 class SupervisedGoal:
-    """The state of a goal from its submission until its `Ended` is posted. Times are monotonic."""
+    """The state of a goal from its submission until its `Ended` is posted.
+
+    Times are monotonic.
+    """
 
     command: protocol.GoalCommand
     #: whether the goal was sent to the current process
@@ -166,7 +177,7 @@ class SupervisedGoal:
     stop_due: float = NEVER
     #: number of the current pause; None if the goal is not paused
     hold_number: int | None = None
-    #: time by which the process must confirm a `Hold`; NEVER if none is unconfirmed
+    #: time by which the process must confirm a `Hold`; NEVER if none is waiting for confirmation
     hold_due: float = NEVER
     #: event that will be posted once `lost_process` has exited
     end: protocol.Ended | None = None
@@ -198,7 +209,7 @@ class Supervisor:
         self._goal: SupervisedGoal | None = None
         #: ID of the neural voice that the process is loading
         self._loading: str | None = None
-        #: time of the last event from the process, or of a later command that the process must answer
+        #: time of the last event from the process, or of the last command that it must answer
         self._last_sign_at = 0.0
         #: killed processes that may not have exited yet, and the time by which they must have exited
         self._dying: dict[EngineProcess, float] = {}
@@ -223,11 +234,14 @@ class Supervisor:
         self._actions.call(lambda: self._append_text(goal_id, text, end=end, broken=broken))
 
     def stop(self, goal_id: str) -> None:
-        """Stop the goal."""
+        """Stop the goal. Its `Ended` is posted once it has stopped."""
         self._actions.call(lambda: self._stop_goal(goal_id))
 
     def pause(self, goal_id: str, number: int) -> None:
-        """Pause the goal. `Held` is posted once the goal is silent, unless the goal is being stopped."""
+        """Pause the goal.
+
+        `Held` is posted once the goal is silent, unless the goal is being stopped.
+        """
         self._actions.call(lambda: self._hold_goal(goal_id, number))
 
     def resume(self, goal_id: str) -> None:
@@ -235,7 +249,7 @@ class Supervisor:
         self._actions.call(lambda: self._hold_goal(goal_id, None))
 
     def announce_next(self, goal_id: str, next_waits: bool, next_is_neural: bool) -> None:
-        """Tell the process whether another goal is waiting behind this one.
+        """Tell the process whether another goal is waiting after the current one.
 
         If so, the process shortens the silence between the two. A message that can't be sent is dropped, because it
         isn't important.
@@ -244,7 +258,10 @@ class Supervisor:
         self._actions.call(lambda: self._process and self._process.send(command))
 
     def load(self, voice: str) -> None:
-        """Load a neural voice. `VoiceLoaded` is posted when loading has finished or failed."""
+        """Load a neural voice if an engine process is ready.
+
+        `VoiceLoaded` is posted when it has finished or failed.
+        """
         self._actions.call(lambda: self._load_voice(voice))
 
     def drop(self, voice: str) -> None:
@@ -252,7 +269,10 @@ class Supervisor:
         self._actions.call(lambda: self._send(protocol.DropVoice(voice)))
 
     def give_up(self, goal_id: str) -> None:
-        """Abandon a goal that didn't end in time, and replace its process. No `Ended` is posted for the goal."""
+        """Abandon a goal that didn't end in time, and replace its process.
+
+        No `Ended` is posted for the goal.
+        """
         self._actions.call(lambda: self._give_up_goal(goal_id))
 
     def close(self) -> None:
@@ -263,7 +283,10 @@ class Supervisor:
     # -- the loop
 
     def _run(self) -> None:
-        """Run the engine thread until `close` is called. Report bugs, because otherwise goals would wait forever."""
+        """Run the engine thread until `close` is called.
+
+        Report bugs, because otherwise goals would wait forever.
+        """
         try:
             while not self._closing:
                 # The time is taken before waiting. If the machine is suspended during the wait, messages that have
@@ -281,7 +304,7 @@ class Supervisor:
             self._shut_down()
 
     def _wait_and_handle(self, until: float) -> None:
-        """Wait until a process sends something, an action is submitted, or the time is reached, and handle it."""
+        """Wait for messages and actions until a deadline, and handle them."""
         watched = dict.fromkeys([self._actions.fileno(), *self._watched], select.POLLIN)
         ready = wait_ready(watched, until - time.monotonic())
         self._actions.run()
@@ -296,7 +319,7 @@ class Supervisor:
         return min([*deadlines, NEVER if self._process else self._restarts.next_start_at])
 
     def _deadlines(self) -> Iterator[tuple[float, str]]:
-        """Yield the current deadlines, each with the error message to report if it is missed."""
+        """Yield the current deadlines, each with an error message."""
         goal, no_sign = self._goal, f"the engine did not respond for {HANG_LIMIT_S:g} s"
         if self._process and not self._process.ready:
             yield self._started_at + START_LIMIT_S, f"the engine was not ready within {START_LIMIT_S:g} s"
@@ -308,7 +331,7 @@ class Supervisor:
             yield self._last_sign_at + HANG_LIMIT_S, f"{no_sign} while loading {self._loading}"
 
     def _handle_deadlines(self, now: float) -> None:
-        """Replace a process that has missed a deadline, start a missing process, or kill a dying one again."""
+        """Handle deadlines that have passed, and start a missing process."""
         missed = next((message for deadline, message in self._deadlines() if now >= deadline), None)
         if missed:
             self._lose_process(missed, Reason.ENGINE_HUNG)
@@ -322,7 +345,7 @@ class Supervisor:
                 self._fail_goal(self._goal, Reason.NOT_SILENT, message)
 
     def _handle_ready(self, process: EngineProcess, descriptor: int) -> None:
-        """Handle a readable descriptor of a process: its exit, its standard error or its messages."""
+        """Handle a readable descriptor of a process."""
         if descriptor == process.liveness:
             if process is self._process:
                 self._receive(process)  # read the last messages of the process before handling its death
@@ -342,7 +365,10 @@ class Supervisor:
         return self._goal if self._goal and self._goal.command.id == goal_id else None
 
     def _begin_goal(self, command: protocol.GoalCommand) -> None:
-        """Make this the current goal, and send it to the process. If no process can start, fail the goal."""
+        """Make this the current goal, and send it to the process.
+
+        If no process can start, fail the goal.
+        """
         self._goal = SupervisedGoal(command)
         if self._restarts.permanent_error is not None:
             self._fail_goal(self._goal, Reason.ENGINE_FAILED, self._restarts.permanent_error)
@@ -350,21 +376,24 @@ class Supervisor:
             self._send_waiting_goal()
 
     def _send_waiting_goal(self) -> None:
-        """Send the current goal to the process, if the goal is waiting and the process is ready."""
+        """Send the waiting goal to the process if both are ready."""
         goal = self._goal
         if goal and not (goal.sent or goal.hold_number or goal.end):
             self._last_sign_at = time.monotonic()
             goal.sent = self._send(goal.command)
 
     def _load_voice(self, voice: str) -> None:
-        """Load a voice. If no process is ready, do nothing, because the server repeats the command to the next one."""
+        """Load a voice.
+
+        If no process is ready, do nothing, because the server repeats the command to the next one.
+        """
         if self._send(protocol.LoadVoice(voice)):
             self._loading, self._last_sign_at = voice, time.monotonic()
 
     def _send(self, command: protocol.Command) -> bool:
-        """Send a command if the process is ready, and return whether it was sent. Replace a process that refuses it.
+        """Send a command if the process is ready, and return whether it was sent.
 
-        A process that doesn't accept the command is replaced.
+        Replace a process that refuses it.
         """
         process = self._process
         if process is None or not process.ready:
@@ -401,7 +430,10 @@ class Supervisor:
             self._send_waiting_goal()
 
     def _stop_goal(self, goal_id: str) -> None:
-        """Tell the process to stop the goal. If the process doesn't have the goal, end it as stopped."""
+        """Tell the process to stop the goal.
+
+        If the process doesn't have the goal, end it as stopped.
+        """
         goal = self._current_goal(goal_id)
         if goal is None or goal.stop_due != NEVER:
             return
@@ -434,7 +466,7 @@ class Supervisor:
     # -- the process
 
     def _start_process(self) -> None:
-        """Start an engine process. If this fails, report it and schedule another start."""
+        """Start an engine process, or schedule another start if this fails."""
         self._started_at = time.monotonic()
         try:
             process = EngineProcess(self._configure, self._report_stderr)
@@ -447,7 +479,7 @@ class Supervisor:
         self._watched |= dict.fromkeys((process.socket.fileno(), process.liveness, process.stderr), process)
 
     def _report_stderr(self, line: str) -> None:
-        """Post a line from a process's standard error, unless there were too many lines recently."""
+        """Post a line of a process's standard error, unless there are too many."""
         omitted = self._stderr_quota.count_event(time.monotonic())
         if omitted:
             self._post(EngineSaid(f"({omitted} lines were omitted)"))
@@ -469,7 +501,7 @@ class Supervisor:
         self._lose_process(f"the engine crashed: {process.describe_exit()}", Reason.ENGINE_CRASHED)
 
     def _handle_event(self, process: EngineProcess, event: protocol.Event) -> None:
-        """Update the state after an event from the process, and post the event if others need it."""
+        """Handle an event from the process."""
         self._last_sign_at = time.monotonic()
         if isinstance(event, protocol.GoalEvent):
             goal = self._current_goal(event.id)
@@ -487,7 +519,7 @@ class Supervisor:
         self._send_waiting_goal()
 
     def _handle_goal_event(self, goal: SupervisedGoal, event: protocol.GoalEvent) -> None:
-        """Update the current goal after an event about it, and post the event if others need it."""
+        """Handle an event about the current goal."""
         if isinstance(event, protocol.Started):
             goal.started = True
         elif isinstance(event, protocol.Ended):
@@ -499,7 +531,7 @@ class Supervisor:
             self._post(event)
 
     def _lose_process(self, message: str, reason: Reason, failure: protocol.StartFailed | None = None) -> None:
-        """Kill the process, decide what happens to its goal, and schedule the next start.
+        """Kill the process, and schedule the next start.
 
         Args:
             message: a human-readable description of what happened.
@@ -542,7 +574,10 @@ class Supervisor:
         goal.sent, goal.stop_due, goal.hold_due = False, NEVER, NEVER
 
     def _handle_failed_start(self, message: str, *, permanent: bool = False) -> None:
-        """Schedule another start. Fail the waiting goal if the error is permanent or the goal has waited too long."""
+        """Schedule another start.
+
+        Fail the waiting goal if the error is permanent or the goal has waited too long.
+        """
         ends_goal = self._restarts.start_failed(time.monotonic(), self._started_at, message if permanent else None)
         waiting = self._goal if self._goal and not self._goal.end else None
         if waiting and (ends_goal or permanent):
@@ -551,7 +586,7 @@ class Supervisor:
             self._post(EngineMissing(message))
 
     def _release_process(self, process: EngineProcess) -> None:
-        """Release a process that has exited, and end the goal that was waiting for its exit."""
+        """Release a process that has exited, and end its goal."""
         del self._watched[process.liveness]
         if self._watched.pop(process.stderr, None):
             process.read_stderr()
@@ -562,7 +597,7 @@ class Supervisor:
             self._end_goal(goal.end)
 
     def _shut_down(self) -> None:
-        """Kill the process, wait a limited time for it to exit, and close all descriptors."""
+        """Kill the process, wait briefly for it to exit, and close all descriptors."""
         self._lose_process("the server is shutting down", Reason.SHUTDOWN)
         deadline = time.monotonic() + KILL_LIMIT_S / 4
         while self._dying and time.monotonic() < deadline:

@@ -41,7 +41,9 @@ class LocalConnection(ClientCore):
         self._lines: list[bytes] = []
 
     async def greet(self, hello: JsonObject) -> None:
-        """Send `hello`, and wait for the server's greeting. Close the connection if this fails.
+        """Send `hello`, and wait for the server's greeting.
+
+        Close the connection if this fails.
 
         Raises:
             ServerUnavailable, AccessDenied, ProtocolMismatch, Busy: the server can't be used.
@@ -66,7 +68,7 @@ class LocalConnection(ClientCore):
         self.connected(server, self._loop.time())
 
     async def read(self) -> list[bytes]:
-        """Wait for lines, and return them without their newlines.
+        """Wait for lines, and return them without newlines.
 
         If the connection has ended, return an empty list.
         """
@@ -83,7 +85,10 @@ class LocalConnection(ClientCore):
         return lines
 
     def send(self, exchange: Exchange) -> bool:
-        """Send the request of an exchange, which will receive the answer. Return False if the request is too long."""
+        """Send the request of an exchange, which will receive the answer.
+
+        Return False if the request is too long.
+        """
         self.register(exchange, self._loop.time())
         line = self.line(exchange)
         if len(line) > MAX_LINE_BYTES:
@@ -95,7 +100,9 @@ class LocalConnection(ClientCore):
         return True
 
     def close(self) -> None:
-        """Close the connection. If a `read` is waiting, first cancel it or end it with `abort`.
+        """Close the connection.
+
+        A waiting `read` must first be canceled, or ended with `abort`.
 
         The server cancels the requests that it has not answered, if possible.
         """
@@ -105,12 +112,18 @@ class LocalConnection(ClientCore):
             self._socket.close()
 
     def abort(self) -> None:
-        """Shut down the connection, so that a waiting `read` returns. The reader must then call `close`."""
+        """Shut down the connection, so that a waiting `read` returns.
+
+        The reader must then call `close`.
+        """
         with contextlib.suppress(OSError):
             self._socket.shutdown(_socket.SHUT_RDWR)
 
     def _flush(self) -> None:
-        """Send as much as possible without blocking. Send the rest when the socket becomes writable."""
+        """Send as much as possible without blocking.
+
+        Send the rest when the socket becomes writable.
+        """
         if self._socket.fileno() < 0:
             return
         try:
@@ -128,7 +141,9 @@ class LocalConnection(ClientCore):
 
 
 async def dial(socket: str | None, name: str, *, urgent: bool = False) -> LocalConnection:
-    """Connect to the server, try again while it is busy, and return the connection after the server's greeting.
+    """Connect to the server, and return the connection after the greeting.
+
+    Keep trying while the server is busy.
 
     Args:
         socket: path of the server's socket, or None for the default locations.

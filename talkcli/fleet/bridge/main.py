@@ -156,7 +156,10 @@ class Bridge:
         self._error: BaseException | None = None
 
     async def run(self) -> None:
-        """Keep the robot connected until `end` is called. Then take it offline, and raise the error given to `end`."""
+        """Keep the robot connected until `end` is called.
+
+        Then take it offline, and raise the error given to `end`.
+        """
         self._broker.ssl_context()  # check the certificate files before anything is started
         log.write(f"starting: robot {self._settings.name}, broker {self._broker.url}")
         self._systemd.notify_ready()
@@ -197,7 +200,10 @@ class Bridge:
     # -- the connection
 
     async def _stay_connected(self) -> None:
-        """Connect to the broker. Whenever the connection ends, read the broker's settings again and reconnect."""
+        """Connect to the broker.
+
+        Whenever the connection ends, read the broker's settings again and reconnect.
+        """
         client_id = f"talk-{self._settings.name}-{self._session}"
         while True:
             try:
@@ -265,7 +271,10 @@ class Bridge:
         log.write(f"online at {self._broker.url}")
 
     def _disconnect(self, link: Link) -> None:
-        """Close a connection to the broker. If it is the current one, also end the sessions of all clients."""
+        """Close a connection to the broker.
+
+        If it is the current one, also end the sessions of all clients.
+        """
         if self._link is link:
             self._link, self._online = None, False
             self._unwatch_link()
@@ -318,7 +327,9 @@ class Bridge:
             self._loop.remove_writer(self._descriptor)
 
     def _publish(self, message: Message, qos: int = 1, acknowledged: OnAcknowledged | None = None) -> None:
-        """Publish a message if there is a connection. Drop it if it is too long for the broker.
+        """Publish a message if there is a connection.
+
+        Drop it if it is too long for the broker.
 
         The arguments are those of `Link.publish`. By default, a warning is logged if the broker rejects the message.
         """
@@ -333,7 +344,10 @@ class Bridge:
         self._handle_link_state(link)
 
     def _publish_to_all(self, message: Message) -> None:
-        """Publish a status or an event, if the robot is online. Drop events while the broker is slow."""
+        """Publish a status or an event, if the robot is online.
+
+        Drop events while the broker is slow.
+        """
         if self._online and self._link and (message.retained or self._link.outstanding_bytes <= SLOW_BROKER_BYTES):
             self._publish(message)
 
@@ -356,7 +370,7 @@ class Bridge:
             log.write_bug("a message from the broker", error)
 
     def _handle_message(self, message: Message) -> None:
-        """Process a message from the broker: an echo, a presence, or a request that the policy accepts or refuses."""
+        """Process an echo, a presence message or a client's request from the broker."""
         if message.topic == self._echo_topic:
             self._handle_echo(message.payload)
             return
@@ -384,7 +398,7 @@ class Bridge:
                 self._send_echo()
 
     def _handle_echo(self, payload: bytes) -> None:
-        """Process this bridge's own echo, or a bridge's question whether the robot's name is in use."""
+        """Process this bridge's own echo, or another bridge's question whether the robot's name is in use."""
         if payload.startswith(_RIVAL_QUESTION):
             if payload != _RIVAL_QUESTION + self._session.encode():
                 if self._online:
@@ -398,7 +412,9 @@ class Bridge:
             self._policy.record_echo(sent_at, boottime())
 
     def _handle_presence(self, payload: bytes) -> None:
-        """Find out from a presence message whether another bridge has this robot's name. The younger bridge ends.
+        """Check a presence message for another bridge with this robot's name.
+
+        The younger of the two bridges ends.
 
         It may come from this bridge, an earlier one, or another one with the same robot name.
         """
@@ -466,7 +482,10 @@ class Bridge:
             self._publish_presence()
 
     async def _go_offline(self) -> None:
-        """Disconnect from the broker. Publish that the robot is offline, unless another bridge has its name."""
+        """Disconnect from the broker.
+
+        Report the robot as offline first, unless another bridge uses its name.
+        """
         link = self._link
         if link is None:
             return

@@ -124,14 +124,17 @@ class Policy:
         self.newest_echo_at = 0.0
 
     def record_echo(self, sent_at_text: bytes, now: float) -> None:
-        """Record that an echo has returned. Ignore it if it has an invalid time, or one after `now`."""
+        """Record that an echo has returned.
+
+        Ignore it if its time is invalid or later than `now`.
+        """
         with contextlib.suppress(ValueError):
             sent_at = float(sent_at_text)
             if self.newest_echo_at < sent_at <= now:
                 self.newest_echo_at = sent_at
 
     def decide(self, message: Message, kind: str, user: str, now: float) -> RemoteRequest | Refusal | Goodbye | Ignored:
-        """Decide whether to accept, refuse or ignore a message, or to end its client's session.
+        """Return the decision to accept, refuse or ignore a message, or to end its client's session.
 
         Args:
             message: a message on a request topic of the robot or one of its groups.
@@ -161,7 +164,7 @@ class Policy:
             request = read_request(fields)
             needed = Say.kind if isinstance(request, Append) else request.kind
             if needed not in self._allow:
-                words = f"remote clients may not use {needed} on this robot; add it to --allow of its bridge"
+                words = f"this robot's bridge does not allow {needed} requests; add {needed} to its --allow"
                 raise BadRequest(words, "not_allowed")
             if isinstance(request, Say) and now - self.newest_echo_at > STALE_AFTER_S:
                 words = "the connection to the broker stalled; send the sentence again if it is still true"
@@ -185,7 +188,7 @@ def _parse_request_fields(kind: str, payload: bytes) -> JsonObject:
         return {"request": "cancel"}
     line = payload.removesuffix(b"\n") if kind == topics.REQUEST else payload
     if len(line) >= MAX_LINE_BYTES:
-        raise LineTooLong(f"a request must have at most {MAX_LINE_BYTES} bytes")
+        raise LineTooLong(f"the request is longer than {MAX_LINE_BYTES:,} bytes")
     if kind == topics.REQUEST:
         return decode(line)
     try:
@@ -219,7 +222,10 @@ class SentIds:
         return self.boot_of(goal_id) == boot and self._sent[goal_id][2]
 
     def add(self, goal_id: str, boot: str, user: str, *, counted: bool = True) -> None:
-        """Record that a user sent a goal to the server with this boot id. Forget the oldest id if necessary."""
+        """Record that a user sent a goal to the server with this boot id.
+
+        Forget the oldest goal if there are too many.
+        """
         self._sent.pop(goal_id, None)
         self._sent[goal_id] = boot, user, counted
         if len(self._sent) > MAX_REMEMBERED_IDS:
@@ -267,7 +273,9 @@ class RemoteGoals:
         self._goals.setdefault(goal_id, (key, False))
 
     def record_reply(self, goal_id: str, *, pending: bool) -> None:
-        """Record from the server's reply to `say` whether a goal is pending. If it isn't, remove the goal.
+        """Record from the server's reply to `say` whether a goal is pending.
+
+        If it isn't, remove the goal.
 
         The reply is ignored if an event has already confirmed that the goal is pending.
 

@@ -108,7 +108,11 @@ class Publisher:
             self._retry_s = min(_LAST_SERVER_RETRY_S, self._retry_s * 2)
 
     async def _watch_server(self, server: LocalConnection) -> None:
-        """Watch the server, and process its lines until the connection ends."""
+        """Watch the server, and process its lines until the connection ends.
+
+        Raises:
+            ServerUnavailable: The server refused to be watched.
+        """
 
         def remember(_: JsonObject, ended: list[JsonObject]) -> None:
             for goal in goals(ended, "goal"):
@@ -165,7 +169,10 @@ class Publisher:
         self._set_server(about, status, server.boot)
 
     def _set_server(self, about: JsonObject | None, status: ServerStatus, boot: str) -> None:
-        """Replace the state of the server and its goals, and report the change. `about` is the new `server`."""
+        """Store a new state of the server and its goals, and report the change.
+
+        `about` replaces `server`.
+        """
         self.server = about
         self._active = status.active.id if status.active else None
         self._texts = {each.id: _shown_text(each) for each in unfinished(status)}
@@ -217,7 +224,10 @@ class Publisher:
     # -- to the broker
 
     def _publish_status(self) -> None:
-        """Publish the robot's status as a retained message. Leave out texts that are private or too long."""
+        """Publish the robot's status as a retained message.
+
+        Leave out texts that are private or too long.
+        """
         self._timer, self._published_at = None, self._loop.time()
         active, last = self._active, self._last
         text = self._texts.get(active) if active else None

@@ -1,4 +1,6 @@
-"""Sessions of remote clients. Each session is one client's connection to the robot's server.
+"""Sessions of remote clients.
+
+Each session is one client's connection to the robot's server.
 
 A session sends its client's requests to the server and publishes the server's lines in their order. `policy` has
 already accepted the requests. If too many goals are pending, a patient goal waits here for room, and other goals are
@@ -88,13 +90,16 @@ class RemoteSessions:
         self._loop = asyncio.get_running_loop()
         self._sessions: dict[tuple[str, str | None], RemoteSession] = {}
         self._release_handle: asyncio.Handle | None = None
-        #: the client that has canceled pending goals since `_release` last ran; None if none has
+        #: the client that has canceled pending goals since `_release` last ran; None if no client has
         self._canceled_by: By | None = None
 
     # -- from the broker
 
     def submit(self, request: RemoteRequest) -> None:
-        """Pass a request to its client's session. Create the session, or refuse the request if there are too many."""
+        """Pass a request to its client's session.
+
+        Create the session, or refuse the request if there are too many.
+        """
         key = request.user, request.reply_topic
         session = self._sessions.get(key) or RemoteSession(self, *key)
         if key in self._sessions or self._make_room(urgent=isinstance(request.request, Cancel | Status)):
@@ -115,7 +120,10 @@ class RemoteSessions:
         self.may_read.set()
 
     def tick(self) -> None:
-        """Every few seconds, end silent clients' sessions, and send signs of life to clients with waiting goals."""
+        """End silent clients' sessions, and send signs of life to clients with waiting goals.
+
+        Call this every few seconds.
+        """
         now = self._loop.time()
         for session in list(self._sessions.values()):
             if now - session.used_at > CLIENT_SILENCE_LIMIT_S:
@@ -125,7 +133,9 @@ class RemoteSessions:
                 session.send_alive()
 
     def _make_room(self, *, urgent: bool) -> bool:
-        """End an idle session if there are too many sessions. Return whether there is room for a new one.
+        """End an idle session if there are too many sessions.
+
+        Return whether there is room for a new one.
 
         For an `urgent` request, any session may be ended.
         """
@@ -135,7 +145,7 @@ class RemoteSessions:
         candidates = [each for each in sessions if each.idle] or (sessions if urgent else [])
         if candidates:
             oldest = min(candidates, key=lambda each: each.used_at)
-            oldest.end("the session was closed to make room for an urgent request of another client")
+            oldest.end("the session was closed to make room for an urgent request from another client")
         return bool(candidates)
 
     # -- from the sessions
@@ -149,14 +159,14 @@ class RemoteSessions:
         return sum(each.size_bytes for session in self._sessions.values() for each in session.unanswered)
 
     def cancel_waiting(self, selection: Cancel, canceled_by: By | None) -> list[Goal]:
-        """Cancel the goals that match a `cancel` request while they wait in the bridge, and return them."""
+        """Cancel the goals waiting in the bridge that match a `cancel` request, and return them."""
         selected = [self.waiting[each] for each in selection.select_waiting([say for _, say, _ in self.waiting])]
         self.waiting = [each for each in self.waiting if not any(each is other for other in selected)]
-        ending = State.RECALLED, "canceled", "not spoken: it was cancelled first", canceled_by
+        ending = State.RECALLED, "canceled", "not spoken: the goal was cancelled before it started", canceled_by
         return [session.end_goal(request, say, *ending) for request, say, session in selected]
 
     def handle_pending_change(self) -> None:
-        """Call `on_change`, and if any goals are waiting, schedule a call of `_release`.
+        """Call `on_change`, and schedule a call of `_release` if any goals are waiting.
 
         Call this whenever the number of pending goals may have changed. Events that were received together are all
         processed before goals are released.
@@ -179,7 +189,7 @@ class RemoteSessions:
     # -- from the watch of the server
 
     def handle_goal_change(self, event: StateChanged, boot: str) -> None:
-        """Update the pending goals after a state change, which was reported by the server with this boot id."""
+        """Update the pending goals after a state change reported by the server with this boot id."""
         goal = event.goal
         if event.state is not State.PENDING:
             counted = self.goals.remove(event.id)
@@ -190,7 +200,9 @@ class RemoteSessions:
         self.handle_pending_change()
 
     def remember(self, goal: Goal, boot: str) -> None:
-        """Remember the id of a remote client's goal, which an earlier bridge process may have sent.
+        """Remember the id of a remote client's goal, in case an earlier bridge process sent it.
+
+        Ignore other goals.
 
         The goal counts towards the limit even if it was sent with `preempt`, because the server doesn't report that.
         """
@@ -221,7 +233,10 @@ class _RemoteExchange(Exchange):
 
 
 class RemoteSession:
-    """One remote client's connection to the server. All methods run in the event loop's thread."""
+    """One remote client's connection to the server.
+
+    All methods run in the event loop's thread.
+    """
 
     def __init__(self, sessions: RemoteSessions, user: str, reply_topic: str | None) -> None:
         """Create a session that isn't connected to the server yet.
@@ -285,7 +300,9 @@ class RemoteSession:
         self._end_if_done()
 
     def end(self, why: str | None = None) -> None:
-        """End the session. The server cancels unfinished requests, if possible.
+        """End the session, and drop its queued requests.
+
+        The server cancels unfinished requests, if possible.
 
         Args:
             why: a message for the client, which is sent only if the client is waiting for something.
@@ -333,7 +350,10 @@ class RemoteSession:
     # -- to the server
 
     def _send_request(self, remote: RemoteRequest) -> None:
-        """Send a client's request to the server. A goal may have to wait, and a cancel first ends waiting goals."""
+        """Send a client's request to the server.
+
+        Goals may have to wait, and `cancel` first cancels waiting goals.
+        """
         request = remote.request
         if isinstance(request, Say):
             self.send_say(remote, request)
@@ -350,7 +370,9 @@ class RemoteSession:
             self._send(_RemoteExchange(remote, request))
 
     def send_say(self, remote: RemoteRequest, say: Say, *, has_room: bool = False) -> None:
-        """Send a goal to the server, or reject it if too many goals are pending. Patient goals wait for room.
+        """Send a goal to the server, or reject it if too many goals are pending.
+
+        Patient goals wait for room.
 
         Args:
             remote: the client's request.
@@ -376,7 +398,7 @@ class RemoteSession:
             shared.waiting.append((remote, say, self))
         else:
             words = f"{policy.MAX_REMOTE_GOALS} goals of remote clients are already waiting"
-            # As at the server, a rejected goal doesn't get the id that its client has chosen.
+            # Like the server, don't give a rejected goal the id that its client has chosen.
             self.end_goal(remote, replace(say, id=None), State.REJECTED, "queue_full", f"not spoken: {words}")
 
     def _send_cancel(self, remote: RemoteRequest, cancel: Cancel) -> None:
@@ -398,7 +420,7 @@ class RemoteSession:
         """Send a request to the server. If it is too long, refuse it and return False."""
         assert self._server
         if not self._server.send(exchange):
-            self.refuse(exchange.remote, "line_too_long", f"a request must have at most {MAX_LINE_BYTES} bytes")
+            self.refuse(exchange.remote, "line_too_long", f"the request is longer than {MAX_LINE_BYTES:,} bytes")
             return False
         return True
 
@@ -454,7 +476,10 @@ class RemoteSession:
         self._end_if_done()
 
     def _process_answer(self, message: JsonObject) -> list[tuple[bytes, bytes | None]]:
-        """Process one line of the server's answer. Return lines for the client, with their correlation data."""
+        """Process one line of the server's answer.
+
+        Return lines for the client, with their correlation data.
+        """
         assert self._server
         exchange = self._server.match(message)
         if not isinstance(exchange, _RemoteExchange):
@@ -478,7 +503,10 @@ class RemoteSession:
         return [(encode(item(remote.seq, **each)), remote.correlation) for each in (*found, message)]
 
     def _record_say_reply(self, exchange: _RemoteExchange, state: State | None, *, refused: bool) -> None:
-        """If a request is a `say`, record whether its goal is pending. Forget the id of a refused goal."""
+        """If a request is a `say`, record whether its goal is pending.
+
+        Forget the id of a refused goal.
+        """
         if exchange.goal_id is not None:
             self._sessions.goals.record_reply(exchange.goal_id, pending=state is State.PENDING)
             if exchange.is_new and refused:

@@ -50,10 +50,16 @@ _FIRST_BROKER_PAUSE_S, _MAX_BROKER_PAUSE_S = 0.5, 10.0
 
 
 class DeskHandler(Protocol):
-    """Interface for an object that processes the messages of a DeskLink. `DeskLink.poll` calls its methods."""
+    """Interface for an object that processes the messages of a DeskLink.
+
+    `DeskLink.poll` calls its methods.
+    """
 
     def on_connected(self, link: Link) -> None:
-        """Called when the link has connected to the broker. This method has to subscribe to topics."""
+        """Called when the link has connected to the broker.
+
+        This method has to subscribe to topics.
+        """
 
     def on_disconnected(self, why: str) -> None:
         """Called when the connection is lost, and when an attempt to connect fails."""
@@ -98,7 +104,10 @@ class DeskLink:
 
     @property
     def retained_received(self) -> bool:
-        """Whether the retained messages have arrived, because the marker after them came back some time ago."""
+        """Whether all retained messages count as received.
+
+        They do shortly after the marker message has arrived.
+        """
         return self.marker_at is not None and time.monotonic() > self.marker_at + RETAINED_GRACE_S
 
     def reply_topic(self, robot: str) -> str:
@@ -106,7 +115,9 @@ class DeskLink:
         return topics.reply(self.user, self.session, robot)
 
     def poll(self, timeout: float, interrupt: Mapping[int, int] | None = None) -> bool:
-        """Wait for messages, and pass them to the handler. Connect or reconnect if necessary.
+        """Wait for messages, pass them to the handler, and return whether data was read.
+
+        Reconnect if necessary.
 
         Args:
             timeout: the maximum time to wait in seconds.
@@ -137,7 +148,10 @@ class DeskLink:
         return descriptor in ready
 
     def _receive(self, message: Message) -> None:
-        """Pass a message to the handler. If it is the marker after the retained messages, record that it arrived."""
+        """Pass a message to the handler.
+
+        If it is the marker message, record the time of its arrival instead.
+        """
         if message.topic == self.reply_topic(topics.MARKER):
             self.marker_at = time.monotonic()
         else:
@@ -217,7 +231,7 @@ class DeskLink:
             self._wake_writer.send(b"\0")
 
     def flush(self, timeout: float) -> None:
-        """Poll until the broker has acknowledged all messages, but at most for `timeout` seconds."""
+        """Poll until the broker has acknowledged all messages, but for at most `timeout` seconds."""
         end = time.monotonic() + timeout
         while self.link is not None and self.link.outstanding_bytes and (left := end - time.monotonic()) > 0:
             self.poll(left)
@@ -255,7 +269,10 @@ class DeskLink:
         return self._rejection_error(REASON_NOT_AUTHORIZED, f"read {topics.reply(self.user, '+', '+')}")
 
     def _maintain(self, link: Link | None, now: float) -> float:
-        """Connect, or keep the connection alive. Return the number of seconds after which to call this again."""
+        """Connect, or keep the connection alive.
+
+        Return the number of seconds after which to call this again.
+        """
         if link is not None:
             link.tick()
             if self.marker_at is None or self.retained_received:
@@ -276,7 +293,10 @@ class DeskLink:
         return TICK_EVERY_S if self._opening else max(0.0, self._next_attempt_at - now)
 
     def _end_attempt(self, opening: LinkOpener) -> None:
-        """Start using the connection that was opened. If opening it has failed, schedule the next attempt."""
+        """Start using a newly opened connection.
+
+        If it could not be opened, schedule the next attempt.
+        """
         self._opening = None
         if opening.error is not None:
             self._failed_attempts += 1

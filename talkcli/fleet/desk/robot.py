@@ -58,11 +58,14 @@ _MAX_OPEN_LOOKUPS = 32
 
 
 class RobotExchange(Exchange):
-    """A request to a robot, and the robot's answer. The request stays open while the robot is absent."""
+    """A request to a robot, and the robot's answer.
+
+    The request stays open while the robot is absent.
+    """
 
     #: how many times the request has been sent again
     resends = 0
-    #: when the sentence expires (in `boottime`), or None if it never does
+    #: when the sentence expires (by the `boottime` clock), or None if it never does
     latest: float | None = None
 
 
@@ -136,7 +139,7 @@ class RobotConnection(Connection):
             self._desk.wake()  # The request will be sent when the robot is back.
 
     def expect_reply(self, exchange: RobotExchange) -> None:
-        """Register an exchange to receive its answer, because its request was sent to the robot's group."""
+        """Register an exchange whose request was sent to the robot's group, so that it receives the answer."""
         exchange.sent = True
         self._published_at = time.monotonic()
         self.register(exchange, self._published_at)
@@ -189,7 +192,7 @@ class RobotConnection(Connection):
 
     def goals_lost_at(self) -> float:
         """Return infinity, because `silent_by` ends the connection before goals count as lost."""
-        return float("inf")  # `silent_by` ends the connection before goals count as lost.
+        return float("inf")
 
     def silent_by(self, began: float) -> tuple[float, str]:
         """Return the time at which to give up on a silent or absent robot, and the reason to report."""
@@ -203,7 +206,7 @@ class RobotConnection(Connection):
         return ProtocolMismatch(f"{self.robot}: {error.message}") if error else None
 
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
-        """Return the error that a refusing reply reports. Errors of the bridge have classes of their own."""
+        """Return the error for a reply that refuses a request, with a special class for errors of the bridge."""
         error = super().refusal(reply, items)
         kinds = {"not_allowed": AccessDenied, "no_server": NoServer, "stale": ServerUnavailable, "lost": Lost}
         kind = kinds.get(error.code)
@@ -248,7 +251,9 @@ class RobotConnection(Connection):
             self.absent_since = time.monotonic()
 
     def _update_presence(self, payload: bytes) -> None:
-        """Update whether the robot is absent, from its presence message. If it is back, send open requests again.
+        """Read from a presence message whether the robot is absent.
+
+        When it is back, send open requests again.
 
         It comes from the robot's bridge, or from the broker if the bridge has lost its connection.
         """
@@ -271,9 +276,11 @@ class RobotConnection(Connection):
     # -- connecting
 
     def wait_online(self, give_up: float) -> None:
-        """Wait until the robot can receive requests, at most until `give_up` (monotonic time).
+        """Wait until the robot can receive requests.
 
-        If it is offline, wait until `give_up` (monotonic time). Raises the same errors as `connect_robot`.
+        Raises an error if it still can't at the time `give_up`.
+
+        `give_up` is a monotonic time. The errors are the same as those of `connect_robot`.
         """
         left = self._patience if self._end is None else max(0.0, self._end - time.monotonic())
         self._desk.wait_for_retained(min(self._patience, left), lambda: bool(self._presence), self._interrupt)
@@ -294,7 +301,7 @@ class RobotConnection(Connection):
     # -- after an absence
 
     def _resume_requests(self) -> None:
-        """After an absence, send each open request again, or fail it, or look up its goal."""
+        """After an absence, resend or fail each open request, or look up its goal."""
         now = time.monotonic()
         if self._sender:
             self._send_without_answer(Hello(self._sender))
@@ -320,7 +327,10 @@ class RobotConnection(Connection):
             self._watch_again(now)
 
     def _resend(self, exchange: RobotExchange) -> None:
-        """Send a request again. It fails if its ttl has expired, or if it has been sent too many times."""
+        """Send a request again.
+
+        It fails if its ttl has expired, or if it has been sent too many times.
+        """
         if exchange.number not in self.exchanges:
             return  # The caller has stopped waiting for the answer.
         request = exchange.request
@@ -342,12 +352,18 @@ class RobotConnection(Connection):
         self._publish(exchange)
 
     def _lost_error(self, exchange: Exchange, why: str) -> Lost:
-        """Return the error for a request that was sent but not answered. `why` says why the answer is missing."""
+        """Return the error for a request that was sent but not answered.
+
+        `why` says why the answer is missing.
+        """
         words = f"the {exchange.request.kind} request was sent to {self.path}, but {why}"
         return Lost(f"{words}; it may have been carried out")
 
     def _look_up_goal(self, exchange: RobotExchange, request: Say, now: float) -> None:
-        """Ask the robot whether it has accepted a goal. If it doesn't know the goal, send the goal again."""
+        """Ask the robot whether it has accepted a goal.
+
+        If it doesn't know the goal, send the goal again.
+        """
 
         def on_reply(_: JsonObject, items: list[JsonObject]) -> None:
             for each in items:
@@ -365,7 +381,7 @@ class RobotConnection(Connection):
         self._begin(Exchange(Wait((str(request.id),), request.feedback), on_reply, on_failure), now)
 
     def _begin(self, exchange: Exchange, now: float) -> None:
-        """Queue a request that looks up a goal, and send it if not too many are open."""
+        """Queue a goal lookup, and send it now if the number of open lookups allows it."""
         self._lookups.append(exchange)
         self._send_lookups(now)
 
@@ -378,7 +394,10 @@ class RobotConnection(Connection):
             self._publish(exchange)
 
     def dispatch(self, message: JsonObject, now: float) -> Exchange | None:
-        """Process a message from the robot's server or bridge. Return the exchange that it ends, or None."""
+        """Process a message from the robot's server or bridge.
+
+        Return the exchange that it ends, or None.
+        """
         if message.get("event") == "gone":
             self.end(printable(str(message.get("message") or "the connection to the server was lost")))
             return None
@@ -400,7 +419,10 @@ class RobotConnection(Connection):
         self._desk.wake()
 
     def _drop(self) -> None:
-        """Close the connection to the broker. In a forked child, close only the child's descriptors."""
+        """Close the connection to the broker.
+
+        In a forked child, close only the child's descriptors.
+        """
         self._desk.close(forked=os.getpid() != self._process)
 
 
@@ -434,5 +456,8 @@ def connect_robot(robot: str, broker: Broker, *, keep_trying: float = 0.0, **opt
 
 
 def new_goal_id(desk: DeskLink) -> str:
-    """Return a new random goal id, which begins with the user's name. The colon sets it apart from servers' ids."""
+    """Return a new random goal id, which begins with the user's name.
+
+    The colon sets it apart from servers' ids.
+    """
     return f"{desk.user[:_ID_USER_CHARS]}:{os.urandom(5).hex()}"

@@ -144,6 +144,8 @@ class FleetRequest:
     def results(self, timeout: float | None = None) -> Iterator[Outcome]:
         """Yield the outcomes as they arrive.
 
+        Raises TimeoutError if some are missing after `timeout` seconds.
+
         After a TimeoutError or Interrupted, call this again to receive the remaining outcomes.
 
         Args:
@@ -192,7 +194,7 @@ class FleetRequest:
         if not isinstance(self.request, Say):
             return
         if self._closed:
-            raise UsageError("all outcomes have already been returned; cancel the goal by its id")
+            raise UsageError("this request has ended; to cancel its goal, use the goal's id")
         goal_id = self._canceled_id = str(self.request.id)
         group = self._selection.group
         if group is not None:
@@ -228,11 +230,17 @@ class FleetRequest:
                 self._on_presence(robot, robot.presence)
 
     def _on_refused(self, error: TalkError) -> None:
-        """Store the error for `results` to raise, because the broker has rejected the message to the group."""
+        """Store an error for `results` to raise.
+
+        Called if the broker rejects the message to the group.
+        """
         self._refused = error
 
     def _check_for_late_robots(self) -> None:
-        """Process all waiting messages. Then record a failure for each robot that hasn't answered in time."""
+        """Process all waiting messages.
+
+        Then record a failure for each robot that hasn't answered in time.
+        """
         for _ in range(_MAX_MESSAGES_PER_CHECK):
             if not self._desk.poll(0.0, self._interrupt):
                 break
@@ -280,7 +288,9 @@ class FleetRequest:
                 self._on_presence(robot, presence)
 
     def _on_presence(self, robot: RobotRequest, presence: Presence) -> None:
-        """Include a robot in the request when its presence first arrives. Send the request if possible.
+        """Include a robot in the request when its presence first arrives.
+
+        Send the request if possible.
 
         After all retained messages have arrived, new robots are ignored, because they came online too late. Until then,
         every member of a group is expected to answer. Some members may have come online after the request was sent, but
@@ -326,7 +336,7 @@ class FleetRequest:
         return self._robots[name]
 
     def _include(self, name: str) -> None:
-        """Add a robot to those that the request is for."""
+        """Add a robot to the receivers of the request."""
         self._included.add(name)
         self._unfinished.add(name)
 
@@ -336,13 +346,13 @@ class FleetRequest:
             self._robots[name].update(check_time=check_time)
 
     def _record(self, *outcomes: Outcome) -> None:
-        """Add outcomes to those that `results` yields. A robot has finished after its last outcome."""
+        """Store outcomes for `results` to yield, and mark robots as finished after their last outcome."""
         self._outcomes += outcomes
         self._unfinished -= {each.robot for each in outcomes if each.last}
 
 
 class RobotRequest:
-    """A request to one of the robots of a `FleetRequest`."""
+    """The part of a `FleetRequest` that concerns one robot."""
 
     def __init__(self, connection: RobotConnection, request: Request, record: Callable[..., None]) -> None:
         """Prepare a request. All outcomes are passed to `record`."""
@@ -357,7 +367,10 @@ class RobotRequest:
         self._since = time.monotonic()
 
     def send(self) -> None:
-        """Send the request to this robot only, not to its group. Record a failure if the robot is absent."""
+        """Send the request to this robot only, not to its group.
+
+        Record a failure if the robot is absent.
+        """
         try:
             self.connection.check_online()
             self.connection.begin(self._request, self._on_reply, self._on_failure)
@@ -398,7 +411,10 @@ class RobotRequest:
             self._record(Outcome(self._name, handle.state.name, code, handle.goal, last=not self._handles))
 
     def _on_reply(self, reply: JsonObject, items: list[JsonObject]) -> None:
-        """Start waiting for the goals of the request. If there are none to wait for, record the outcomes."""
+        """Start waiting for the goals of the request.
+
+        If there are none to wait for, record the outcomes.
+        """
         request = self._request
         found: list[Goal] = []
         if isinstance(request, Say):

@@ -112,7 +112,7 @@ def _format_age(seconds: float) -> str:
 
 
 def _fit_columns(widths: dict[str, int], room: int | None) -> None:
-    """Make a line fit into `room` characters: shrink SPEAKING in `widths`, and remove other columns."""
+    """Shrink the column SPEAKING in `widths`, and remove other columns, until a line fits into `room`."""
     longest = widths["SPEAKING"]
     if room is None:
         widths["SPEAKING"] = min(longest, _USUAL_TEXT_CHARS)
@@ -126,7 +126,10 @@ def _fit_columns(widths: dict[str, int], room: int | None) -> None:
 
 
 def _format_row(cells: dict[str, Cell], widths: dict[str, int], screen: Screen) -> str:
-    """Format cells as a line with aligned columns. On a terminal, a long text in SPEAKING is shortened."""
+    """Format cells as a line with aligned columns.
+
+    On a terminal, a long text in SPEAKING is shortened.
+    """
     shown = []
     for name, columns in widths.items():
         text, state = cells[name]
@@ -138,7 +141,10 @@ def _format_row(cells: dict[str, Cell], widths: dict[str, int], screen: Screen) 
 
 
 class FleetTranscript:
-    """Formats events of robots as lines. Each line begins with the time and the robot's name."""
+    """Formats events of robots as lines.
+
+    Each line begins with the time and the robot's name.
+    """
 
     def __init__(self, *, full: bool) -> None:
         """Create an empty transcript. For `full`, see `Transcript`."""
@@ -149,7 +155,10 @@ class FleetTranscript:
         self._boots: dict[str, str] = {}
 
     def begin(self, robots: Sequence[Presence], broker: str, screen: Screen, now: float) -> list[str]:
-        """Return the first line, which shows how many robots there are. Align later lines for these robots."""
+        """Return the first line, which shows how many robots there are.
+
+        Align later lines for these robots.
+        """
         for each in robots:
             self._columns.pad_robot(each.name, screen)  # All names must be known first, so that all lines are aligned.
             self._boots[each.name] = _boot(each)
@@ -169,7 +178,7 @@ class FleetTranscript:
         return self._transcripts[name].lines(event, screen, now)
 
     def change_lines(self, before: Presence | None, robot: Presence, screen: Screen, now: float) -> list[str]:
-        """Return the line that reports a change of a robot or its server. Also forget the robot's earlier goals.
+        """Return a line saying that a robot or its server has changed, and forget the robot's earlier goals.
 
         Args:
             before: the presence before the change, or None if the robot was unknown.

@@ -77,7 +77,10 @@ class EventsMissed:
 
 @frozen
 class BrokerAway:
-    """Reports that the connection to the broker was lost. The watch fails if it isn't back within `limit` seconds."""
+    """Reports that the connection to the broker was lost.
+
+    The watch fails if it isn't back within `limit` seconds.
+    """
 
     why: str
     limit: float
@@ -96,7 +99,9 @@ FleetEvent = FleetSnapshot | RobotChanged | RobotEvent | EventsMissed | BrokerAw
 def read_robots(
     broker: Broker, timeout: float, name: str | None = None, *, with_status: bool = True
 ) -> list[RobotInfo]:
-    """Read the robots of a fleet from the broker, sorted by name. This includes robots that are offline.
+    """Read the robots of a fleet from the broker, sorted by name.
+
+    This includes robots that are offline.
 
     Args:
         broker: the broker of the fleet.
@@ -120,7 +125,7 @@ def read_robots(
 
 
 class _RetainedReader:
-    """Subscriber to some topics that collects all messages."""
+    """Subscribes to some topics, and collects all messages."""
 
     def __init__(self, wanted: list[str]) -> None:
         self._wanted = wanted
@@ -139,7 +144,10 @@ class _RetainedReader:
 
 
 def _read_states(messages: list[Message]) -> list[RobotInfo]:
-    """Read the state of each robot from these messages, sorted by name. Omit robots without a presence."""
+    """Read the state of each robot from these messages, sorted by name.
+
+    Omit robots without a presence.
+    """
     payloads: dict[str, dict[str, bytes]] = {}
     for message in messages:
         _, _, name, kind, *_ = message.topic.split("/")
@@ -152,7 +160,7 @@ def _read_states(messages: list[Message]) -> list[RobotInfo]:
 
 
 class FleetWatch:
-    """Watches all robots of a fleet, or some of them. Only one thread may use this object."""
+    """Watches some or all robots in a fleet. Only one thread may use this object."""
 
     def __init__(self, broker: Broker, selection: Selection | None = None) -> None:
         """Prepare to watch robots. `events` connects to the broker.
@@ -174,11 +182,13 @@ class FleetWatch:
         #: when the connection to the broker was lost (monotonic time) and why, or None if the broker is connected
         self._away_since: float | None = time.monotonic()
         self._away_why = ""
-        #: the robots that haven't reconnected since the broker is back, with their time limits (monotonic time)
+        #: the robots that haven't reconnected since the broker came back, with their time limits (monotonic time)
         self._missing: dict[str, float] = {}
 
     def events(self, interrupt: Mapping[int, int] | None = None) -> Iterator[FleetEvent]:
-        """Yield events until one of the `interrupt` descriptors is ready. The first event is a FleetSnapshot.
+        """Yield events until one of the `interrupt` descriptors is ready.
+
+        The first event is a FleetSnapshot.
 
         Raises:
             Interrupted: One of the descriptors is ready, see `wait_ready`.
@@ -215,7 +225,10 @@ class FleetWatch:
             self._events.append(BrokerAway(why, ABSENCE_LIMIT_S))
 
     def on_message(self, message: Message) -> None:
-        """Process a robot's presence, status or event. On a new connection, first collect all retained messages."""
+        """Process a robot's presence, status or event.
+
+        On a new connection, first collect all retained messages.
+        """
         if self._retained is not None:
             self._retained.append(message)
             return
@@ -238,7 +251,10 @@ class FleetWatch:
     # -- time limits
 
     def _handle_due(self, now: float) -> None:
-        """Process retained messages if complete, forget missing robots, and raise Lost if the broker stays away."""
+        """Report missing robots, and process complete retained messages.
+
+        Raises Lost if the broker is away too long.
+        """
         if self._retained is not None and self._desk.retained_received:
             self._process_retained(self._retained, now)
         if self._away_since is not None and now - self._away_since >= ABSENCE_LIMIT_S:
@@ -272,7 +288,10 @@ class FleetWatch:
             self._report(event)
 
     def _set_presence(self, name: str, now: Presence | None) -> None:
-        """Store a robot's presence. Report it if the robot or its server has started or stopped."""
+        """Store a robot's presence.
+
+        Report it if the robot or its server has started or stopped.
+        """
         before = self._presences.pop(name, None)
         if now:
             self._presences[name] = now
@@ -282,7 +301,7 @@ class FleetWatch:
             self._events.append(RobotChanged(name, before, now))
 
     def _report_missed(self, name: str, status: RobotStatus | None, arrived: Container[str | None] = ()) -> None:
-        """Report missed events of a robot, if its status shows that they happened.
+        """Report an EventsMissed if a robot's status shows goals that haven't been reported.
 
         Args:
             name: the name of the robot.
@@ -301,7 +320,7 @@ class FleetWatch:
             self._events.append(EventsMissed(RobotInfo(presence, status), tuple(missed)))
 
     def _report(self, robot_event: RobotEvent) -> None:
-        """Report an event of a robot if the robot is selected, and remember which goal it was about."""
+        """Report an event of a selected robot, and remember goals that start or end to detect missed events."""
         name, event = robot_event.name, robot_event.event
         if self._selection and name not in self._presences:
             return

@@ -1,4 +1,4 @@
-"""What `urllib.request` asks for the system's proxies on macOS, where it is a part of Python: there are none."""
+"""A replacement for the module that `urllib.request` uses on macOS to find proxies. It finds none."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Makes the Python that starts with this on its path believe that it runs on macOS: for `tests/test_portable.py`.
+"""Make Python behave as on macOS if this directory is on its path (for `tests/test_portable.py`).
 
-What CPython has on Linux and not there is taken away before anything else is imported, and what both have behaves as
-there. Nothing of it is emulated that talk could do without.
+It removes everything that CPython only has on Linux, before anything else is imported, and changes functions that
+behave differently on macOS. It emulates only what talk needs.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import sys
 import time
 from typing import Any
 
-#: Names that CPython doesn't have on macOS (the last of them only from 3.13 on), by the beginning of their names.
+#: Prefixes of the names that CPython doesn't have on macOS.
 _MISSING = {
     fcntl: ("F_SETSIG", "F_GETSIG", "F_SETPIPE_SZ", "F_GETPIPE_SZ", "F_NOTIFY", "F_SETLEASE", "F_OFD_", "DN_"),
     os: (
@@ -40,7 +40,7 @@ _MISSING = {
 }
 _os_fchmod = os.fchmod
 _SO_PEERCRED = _socket.SO_PEERCRED
-#: <sys/un.h>: the level, and the two options that tell who is at the other end.
+#: Constants from <sys/un.h>: the level, and the two options for the peer's credentials.
 _SOL_LOCAL, _LOCAL_PEERCRED, _LOCAL_PEERPID = 0, 0x001, 0x002
 
 
@@ -58,7 +58,7 @@ class _Socket(_socket.socket):
 
 
 def _without_proc(function: Any) -> Any:
-    """Return the function so that it finds nothing under /proc."""
+    """Wrap a function so that /proc doesn't exist for it."""
 
     def wrapped(path: Any = ".", *arguments: Any, **extra: Any) -> Any:
         if isinstance(path, str) and (path == "/proc" or path.startswith("/proc/")):
@@ -81,14 +81,15 @@ class _Library(ctypes.CDLL):
         return super().__getattr__(name)
 
 
-for _module, _beginnings in _MISSING.items():
-    for _name in [each for each in dir(_module) if each.startswith(_beginnings)]:
+for _module, _prefixes in _MISSING.items():
+    for _name in [name for name in dir(_module) if name.startswith(_prefixes)]:
         delattr(_module, _name)
 for _module, _name in ((builtins, "open"), (os, "open"), (os, "listdir"), (os, "scandir"), (os, "stat"), (os, "lstat")):
     setattr(_module, _name, _without_proc(getattr(_module, _name)))
-os.process_cpu_count = os.cpu_count  # type: ignore[attr-defined,unused-ignore]  # from 3.13 on: it would ask sched_…
+os.process_cpu_count = os.cpu_count  # type: ignore[attr-defined,unused-ignore]  # from 3.13 on, it uses sched_…
 _socket.socket = _Socket  # type: ignore[misc]
-# Last: what has been imported up to here may be Linux's own. A Linux without these names tries talk's own driver.
+# At the end, because the modules imported above may be Linux's. With "linux", talk uses its Linux code without these
+# names.
 sys.platform = os.environ.get("TALK_TEST_PLATFORM", "darwin")
 if sys.platform == "darwin":
     os.fchmod = _fchmod

@@ -1,4 +1,4 @@
-"""Measures talk beside its alternatives, and prints a table: see `python -m tests.tools.bench --help`."""
+"""Compare talk with other programs, and print a table (see `python -m tests.tools.bench --help`)."""
 
 from __future__ import annotations
 
@@ -11,29 +11,30 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.errors import TalkError
-from tests.tools.bench import fleet, growing, heard, load, machine, marathon, processes
-from tests.tools.bench.stage import Options, Stage
+from tests.tools.bench import fleet, growing, load, machine, marathon, processes, sound
+from tests.tools.bench.harness import Harness, Options
 from tests.tools.bench.table import Row, as_table
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 _ABOUT = """\
-Starts a sound server with a null sink, a speech-dispatcher (if it is installed) and talk, all private. Runs talk and
-its peers in turn, listens at the sink, and prints medians, 99th percentiles and ratios. Nothing is played aloud. It
-takes under ten minutes, one of them for the idle server. Compare the ratios of one run: the times depend on the
-machine and on its load. The exit code is 1 if a row could not be measured. A goal that is not met is no error.
+Start a private sound server with a null sink, a private speech-dispatcher (if it is installed) and talk. Run talk and
+the other programs in turn, record the sound at the sink, and print medians, 99th percentiles and ratios. Nothing is
+played aloud. This takes less than ten minutes, one of them for the idle server. Compare the ratios of one run, because
+the times depend on the machine and its load. The exit code is 1 if a row could not be measured. A missed goal is not an
+error.
 """
-GROUPS: dict[str, Callable[[Stage], list[Row]]] = {
-    "recorder": heard.recorder,
-    "onset": heard.onset,
-    "at-once": heard.at_once,
-    "cancel": heard.cancel,
-    "connection": heard.connection,
-    "pause": heard.pause,
-    "preempt": heard.preempt,
-    "gap": heard.gap,
-    "long-text": heard.long_text,
+GROUPS: dict[str, Callable[[Harness], list[Row]]] = {
+    "recorder": sound.recorder,
+    "onset": sound.onset,
+    "at-once": sound.at_once,
+    "cancel": sound.cancel,
+    "connection": sound.connection,
+    "pause": sound.pause,
+    "preempt": sound.preempt,
+    "gap": sound.gap,
+    "long-text": sound.long_text,
     "growing": growing.growing,
     "commands": processes.commands,
     "idle": processes.idle,
@@ -41,43 +42,46 @@ GROUPS: dict[str, Callable[[Stage], list[Row]]] = {
     "queue": load.queue,
     "crowd": load.crowd,
 }
-#: Measured only if they are named.
-NAMED: dict[str, Callable[[Stage], list[Row]]] = {
-    "neural": heard.neural,
+#: Groups that are only measured if they are named.
+NAMED: dict[str, Callable[[Harness], list[Row]]] = {
+    "neural": sound.neural,
     "fleet": fleet.fleet,
     "marathon": marathon.marathon,
 }
 
 
-def measure(name: str, stage: Stage) -> list[Row]:
-    """Return the rows of a group, or one row with the reason why they could not be measured."""
+def measure(name: str, harness: Harness) -> list[Row]:
+    """Return the rows of a group, or one row with the reason why they couldn't be measured."""
     try:
-        return (GROUPS | NAMED)[name](stage)
+        return (GROUPS | NAMED)[name](harness)
     except (TalkError, AssertionError, OSError, subprocess.SubprocessError, pytest.skip.Exception) as error:
         return [Row(f"({name})", "", failure=f"{type(error).__name__}: {error}")]
 
 
 def main() -> None:
-    """Measure the rows that the command line names."""
     parser = argparse.ArgumentParser("python -m tests.tools.bench", description=_ABOUT)
-    names = f"{', '.join(GROUPS)}; {', '.join(NAMED)} (these three only if they are named)"
+    names = f"{', '.join(GROUPS)}; {', '.join(NAMED)} (the last three only if they are named)"
     parser.add_argument("rows", nargs="*", metavar="ROW", help=names)
-    parser.add_argument("--rounds", type=int, default=15, help="rounds of each row; some take more (%(default)s)")
-    parser.add_argument("--idle", type=float, default=60, metavar="SECONDS", help="of idle processes (%(default)g)")
-    parser.add_argument("--sentences", type=int, default=10_000, help="of the marathon (%(default)s)")
-    asked = parser.parse_args()
-    unknown = set(asked.rows) - {*GROUPS, *NAMED}
+    parser.add_argument("--rounds", type=int, default=15, help="rounds of each row; some rows have more (%(default)s)")
+    parser.add_argument(
+        "--idle", type=float, default=60, metavar="SECONDS", help="time for idle processes (%(default)g)"
+    )
+    parser.add_argument(
+        "--sentences", type=int, default=10_000, help="number of sentences of the marathon (%(default)s)"
+    )
+    options = parser.parse_args()
+    unknown = set(options.rows) - {*GROUPS, *NAMED}
     if unknown:
         parser.error(f"unknown rows: {', '.join(sorted(unknown))}")
-    found, began, rows = machine.head(), time.monotonic(), []
-    with Stage(Options(asked.rounds, asked.idle, asked.sentences)) as stage:
-        for name in asked.rows or GROUPS:
+    facts, started_at, rows = machine.describe(), time.monotonic(), []
+    with Harness(Options(options.rounds, options.idle, options.sentences)) as harness:
+        for name in options.rows or GROUPS:
             print(f"{name} …", file=sys.stderr, flush=True)
-            rows += measure(name, stage)
-    found["load average"] += f", at the end {machine.load()}"
-    found["took"] = f"{time.monotonic() - began:.0f} s"
-    print("; ".join(f"{name} {value}" for name, value in found.items()), as_table(rows), sep="\n\n")
-    sys.exit(any(each.failure is not None for each in rows))
+            rows += measure(name, harness)
+    facts["load average"] += f", at the end {machine.load()}"
+    facts["took"] = f"{time.monotonic() - started_at:.0f} s"
+    print("; ".join(f"{name} {value}" for name, value in facts.items()), as_table(rows), sep="\n\n")
+    sys.exit(any(row.failure is not None for row in rows))
 
 
 if __name__ == "__main__":

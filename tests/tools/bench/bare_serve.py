@@ -1,9 +1,8 @@
-"""A server that keeps none of talk's promises: the least that a server of this shape must do for a goal.
+"""A bare server that does only the minimum for each goal. `throughput` compares talk with it.
 
-It is the floor of the rows of `throughput`. For each goal it reads one line of JSON and writes the five lines that a
-client is told: reply, PENDING, ACTIVE, SUCCEEDED and result. Between them it hands a line to an engine process. The
-answer comes back through a thread, one goal at a time. It checks nothing, remembers nothing and logs nothing. With
-`--alone` there is no thread and no engine process.
+For each goal, it reads one line of JSON and writes the five lines that a client receives: reply, PENDING, ACTIVE,
+SUCCEEDED and result. Meanwhile, it sends a line to an engine process, whose reply comes through a thread, one goal at a
+time. It doesn't check, store or log goals. With `--no-engine`, there is no thread and no engine process.
 """
 
 from __future__ import annotations
@@ -23,26 +22,25 @@ from talkcli.goals.states import State
 from talkcli.protocol import events
 from talkcli.protocol.lines import MAX_LINE_BYTES, LineSplitter, encode
 
-#: An engine process that ends each sentence at once.
+#: Code of an engine process that ends each sentence at once.
 _ENGINE = "import os\nwhile data := os.read(0, 65536):\n    os.write(0, data)"
 
 
 class Server:
-    """The queue. The engine has its first goal."""
+    """The queue of goals. The first goal is active."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._goals: deque[tuple[str, Client]] = deque()
         self._count = 0
         self._engine: socket.socket | None = None
-        if "--alone" not in sys.argv:
-            self._engine, theirs = socket.socketpair()
-            self._process = subprocess.Popen([sys.executable, "-S", "-c", _ENGINE], stdin=theirs.fileno())
-            theirs.close()
+        if "--no-engine" not in sys.argv:
+            self._engine, engine_end = socket.socketpair()
+            self._process = subprocess.Popen([sys.executable, "-S", "-c", _ENGINE], stdin=engine_end.fileno())
+            engine_end.close()
             threading.Thread(target=self._read, args=(self._engine,), daemon=True).start()
 
     def submit(self, client: Client, seq: int) -> None:
-        """Accept a goal."""
         self._count += 1
         goal_id = f"bare-{self._count}"
         client.send({"seq": seq, "ok": True, "goal": _goal(goal_id, State.PENDING)}, _event(goal_id, State.PENDING))
@@ -72,7 +70,7 @@ class Server:
 
 
 class Client(asyncio.Protocol):
-    """A client."""
+    """A client's connection."""
 
     def __init__(self, server: Server) -> None:
         self._server = server
@@ -93,7 +91,7 @@ class Client(asyncio.Protocol):
                 self.send(events.ok(request.get("seq")))
 
     def send(self, *messages: dict[str, object]) -> None:
-        """Write these lines in one piece."""
+        """Send messages in one write."""
         self._transport.write(b"".join(map(encode, messages)))
 
 
@@ -106,7 +104,6 @@ def _event(goal_id: str, state: State) -> dict[str, object]:
 
 
 async def main() -> None:
-    """Serve until SIGTERM."""
     loop, path = asyncio.get_running_loop(), os.environ["TALK_SOCKET"]
     server, ended = Server(loop), asyncio.Event()
     loop.add_signal_handler(signal.SIGTERM, ended.set)

@@ -1,4 +1,4 @@
-"""Rows of a fleet: a robot that is asked from a desk over a broker, beside the same on the robot's own socket."""
+"""Rows about a fleet: requests from a desk through a broker, compared with requests on the robot's socket."""
 
 from __future__ import annotations
 
@@ -14,73 +14,73 @@ from talkcli.fleet.desk.robot import connect_robot
 from talkcli.protocol.events import StateChanged
 from tests.support.bridge import Bridge, Desk
 from tests.support.broker import Broker
-from tests.tools.bench.machine import megabytes, taken_in
-from tests.tools.bench.stage import SHORT, TALK, serving
+from tests.tools.bench.harness import SHORT, TALK, serving
+from tests.tools.bench.machine import measure_use, megabytes
 from tests.tools.bench.table import Limit, Row
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from tests.support.processes import Talk
-    from tests.tools.bench.stage import Stage
+    from tests.tools.bench.harness import Harness
 
 _ROBOT, _ON_ROBOT = "anna", "on the robot"
 _LONG = "please step back from the moving platform, and wait until it stands still"
-#: Words per minute of sentences that are spoken to their end: as fast as possible.
+#: Words per minute of sentences that are spoken completely: the fastest rate.
 _RATE_WPM = 450
-#: These rows are short.
+#: Factor, because these rows are short.
 _MORE_ROUNDS = 4
 _PATIENCE_S = 10.0
 
 
-def fleet(stage: Stage) -> list[Row]:
-    """Measure a robot at a broker without TLS; then at one with TLS, beside the first."""
-    rounds, seconds = stage.options.rounds * _MORE_ROUNDS, stage.options.idle
+def fleet(harness: Harness) -> list[Row]:
+    """Measure a robot with a broker without TLS, and compare it with a broker with TLS."""
+    rounds, seconds = harness.options.rounds * _MORE_ROUNDS, harness.options.idle
     with contextlib.ExitStack() as stack:
         talk, bridge, env = stack.enter_context(_robot())
-        desk = stack.enter_context(_reach(env))
+        desk = stack.enter_context(_connect(env))
         local = stack.enter_context(Client(talk.socket, name="bench"))
 
-        def beside(action: Callable[[Client], float], other: Client, there: Client) -> dict[str, list[float]]:
-            return stage.in_turn({"here": partial(action, other), "there": partial(action, there)}, rounds)
+        def compare(action: Callable[[Client], float], here: Client, there: Client) -> dict[str, list[float]]:
+            return harness.in_turn({"here": partial(action, here), "there": partial(action, there)}, rounds)
 
         def command(words: tuple[str, ...], env: dict[str, str]) -> float:
-            took = stage.until_end([TALK, *words], env)
-            local.cancel()  # every command meets an idle server
-            return took
+            seconds = harness.until_end([TALK, *words], env)
+            local.cancel()  # so that the server is idle for the next command
+            return seconds
 
-        said, asked, ended = (beside(each, local, desk) for each in (_accepted, _answered, _cancelled))
-        later = stage.in_turn({"later": partial(_result_later, desk, local)}, rounds)["later"]
+        say, status, cancel = (compare(action, local, desk) for action in (_time_say, _time_status, _time_cancel))
+        later = harness.in_turn({"later": partial(_result_later, desk, local)}, rounds)["later"]
         commands = {"here": partial(command, ("say", "hi"), talk.env)}
         commands |= {"there": partial(command, ("--robot", _ROBOT, "say", "hi"), env)}
-        whole = stage.in_turn(commands, rounds)
-        switches = taken_in([bridge.pid], seconds).switches / seconds
-        memory = {each: megabytes(bridge.pid, each) for each in ("Pss", "Rss")}
-        by_tls = stack.enter_context(_reach(stack.enter_context(_robot(secure=True))[2]))
-        said_by_tls, asked_by_tls = (beside(each, desk, by_tls) for each in (_accepted, _answered))
+        whole = harness.in_turn(commands, rounds)
+        switches = measure_use([bridge.pid], seconds).switches / seconds
+        memory = {kind: megabytes(bridge.pid, kind) for kind in ("Pss", "Rss")}
+        tls_desk = stack.enter_context(_connect(stack.enter_context(_robot(secure=True))[2]))
+        tls_say, tls_status = (compare(action, desk, tls_desk) for action in (_time_say, _time_status))
 
     def row(name: str, times: dict[str, list[float]], peer: str, *limits: Limit) -> Row:
         return Row(name, "ms", times["there"], peer, times["here"], limits)
 
     where = f"idle for {seconds:.0f} s"
     return [
-        row("`Client.say()` at a desk → accepted", said, _ON_ROBOT, Limit("median", 10)),
+        row("`Client.say()` at a desk → accepted", say, _ON_ROBOT, Limit("median", 10)),
         Row("result at a client on the robot → at the desk", "ms", later, limits=(Limit("median", 5),)),
-        row("`Client.status()` at a desk", asked, _ON_ROBOT),
-        row("`GoalHandle.cancel()` at a desk, of the active goal", ended, _ON_ROBOT),
+        row("`Client.status()` at a desk", status, _ON_ROBOT),
+        row("`GoalHandle.cancel()` at a desk, of the active goal", cancel, _ON_ROBOT),
         row(f"`talk --robot {_ROBOT} say hi`", whole, "`talk say hi`"),
         Row(f"{where}: context switches of the bridge per second", "/s", [switches], limits=(Limit("median", 2),)),
         Row("memory of the bridge (Pss)", "MB", [memory["Pss"]], limits=(Limit("median", 25),)),
-        # With what it shares with other programs: libssl, libpython.
+        # This includes libraries that it shares with other programs, such as libssl and libpython.
         Row("… with shared memory (Rss)", "MB", [memory["Rss"]]),
-        row("`Client.say()` at a desk with TLS → accepted", said_by_tls, "without"),
-        row("`Client.status()` at a desk with TLS", asked_by_tls, "without"),
+        row("`Client.say()` at a desk with TLS → accepted", tls_say, "without"),
+        row("`Client.status()` at a desk with TLS", tls_status, "without"),
     ]
 
 
 @contextlib.contextmanager
 def _robot(*, secure: bool = False) -> Iterator[tuple[Talk, Bridge, dict[str, str]]]:
-    """Run a broker and a robot there; yield its server, its bridge and the environment of a desk."""
+    """Run a broker and a robot. Yield the robot's server, its bridge, and the environment of a desk."""
     with Broker(secure=secure) as broker, serving("--player", "null") as talk, Bridge(talk, broker, _ROBOT) as bridge:
         bridge.await_online()
         with Desk(broker, user="desk", password=False) as desk:
@@ -88,50 +88,50 @@ def _robot(*, secure: bool = False) -> Iterator[tuple[Talk, Bridge, dict[str, st
         bridge.terminate()
 
 
-def _reach(env: dict[str, str]) -> Client:
+def _connect(env: dict[str, str]) -> Client:
     return Client.over(connect_robot(_ROBOT, from_environment(env), name="bench"))
 
 
-def _accepted(client: Client) -> float:
-    began = time.monotonic()
+def _time_say(client: Client) -> float:
+    started_at = time.monotonic()
     goal = client.say(SHORT)
-    took = time.monotonic() - began
+    seconds = time.monotonic() - started_at
     goal.cancel()
-    return took
+    return seconds
 
 
-def _answered(client: Client) -> float:
-    began = time.monotonic()
+def _time_status(client: Client) -> float:
+    started_at = time.monotonic()
     client.status()
-    return time.monotonic() - began
+    return time.monotonic() - started_at
 
 
-def _cancelled(client: Client) -> float:
+def _time_cancel(client: Client) -> float:
     goal = client.say(_LONG)
     for event in goal.events(_PATIENCE_S):
         if isinstance(event, StateChanged) and event.state is State.ACTIVE:
             break
-    began = time.monotonic()
+    started_at = time.monotonic()
     ended = goal.cancel()
-    took = time.monotonic() - began
+    seconds = time.monotonic() - started_at
     assert ended.state is State.PREEMPTED, ended
-    return took
+    return seconds
 
 
 def _result_later(desk: Client, local: Client) -> float:
-    """Return by how many seconds a desk has a result later than a client that waits for the goal on the robot."""
+    """Return how many seconds later than a client on the robot a desk gets the result."""
     goal = desk.say(SHORT, rate=_RATE_WPM)
-    (same,) = local.follow([goal.id])
+    (local_goal,) = local.follow([goal.id])
     times: list[float] = []
 
     def wait_here() -> None:
-        same.wait(_PATIENCE_S)
+        local_goal.wait(_PATIENCE_S)
         times.append(time.monotonic())
 
     waiting = threading.Thread(target=wait_here)
     waiting.start()
     ended = goal.wait(_PATIENCE_S)
-    there = time.monotonic()
+    desk_time = time.monotonic()
     waiting.join()
     assert ended.state is State.SUCCEEDED, ended
-    return there - times[0]
+    return desk_time - times[0]

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 from tests.support import usage
 from tests.support.connection import Wire
 from tests.support.surroundings import short_directory
-from tests.tools.bench.stage import VOICED, serving
+from tests.tools.bench.harness import VOICED, serving
 from tests.tools.bench.table import Limit, Row
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tests.tools.bench.stage import Stage
+    from tests.tools.bench.harness import Harness
 
 #: A sentence, its last token, and the token after it.
 _SENTENCE, _STOP, _NEXT = ("I", " found", " the", " charger"), ".", " It"
@@ -28,14 +28,14 @@ _MORE_ROUNDS = 2
 _PATIENCE_S = 120.0
 
 
-def growing(stage: Stage) -> list[Row]:
+def growing(harness: Harness) -> list[Row]:
     """Measure what is heard of growing texts, beside a text that is sent as a whole, and how long an addition takes."""
-    with contextlib.closing(_Sender(stage.talk.socket)) as sender:
-        sounds = {each: partial(_sentence_begins, stage, sender, each) for each in (_NEXT, "")}
-        silences = {each: partial(_silence, stage, sender, more=each == "growing") for each in ("growing", "whole")}
-        times = stage.in_turn(sounds)
+    with contextlib.closing(_Sender(harness.talk.socket)) as sender:
+        sounds = {each: partial(_sentence_begins, harness, sender, each) for each in (_NEXT, "")}
+        silences = {each: partial(_silence, harness, sender, more=each == "growing") for each in ("growing", "whole")}
+        times = harness.in_turn(sounds)
         additions = [1000 * each for each in sender.seconds]
-        times |= stage.in_turn(silences, stage.options.rounds * _MORE_ROUNDS)
+        times |= harness.in_turn(silences, harness.options.rounds * _MORE_ROUNDS)
     end = "last token of a growing text's first sentence"
     limits = {bound: [Limit("median", bound)] for bound in (2, 4, 45, 115)}
     return [
@@ -70,7 +70,7 @@ class _Sender(Wire):
         assert result["state"] == wanted, result
 
 
-def _sentence_begins(stage: Stage, sender: _Sender, following: str) -> float:
+def _sentence_begins(harness: Harness, sender: _Sender, following: str) -> float:
     """Return the seconds from the last token of the first sentence to the first sound."""
     goal = sender.say(_SENTENCE[0])
     for token in _SENTENCE[1:]:
@@ -84,10 +84,10 @@ def _sentence_begins(stage: Stage, sender: _Sender, following: str) -> float:
         sender.append(goal, end=True)
         return partial(sender.finish, goal)
 
-    return stage.until_sound(add)
+    return harness.until_sound(add)
 
 
-def _silence(stage: Stage, sender: _Sender, *, more: bool) -> float:
+def _silence(harness: Harness, sender: _Sender, *, more: bool) -> float:
     """Return the seconds from a cancel to silence."""
 
     def say() -> Callable[[], object]:
@@ -97,7 +97,7 @@ def _silence(stage: Stage, sender: _Sender, *, more: bool) -> float:
         assert sender.request("cancel")["ok"]
         return int
 
-    return stage.until_silence(say, stop)
+    return harness.until_silence(say, stop)
 
 
 def _memory() -> float:

@@ -1,4 +1,4 @@
-"""Rows of a busy server: goals a second, steps while many goals are pending, and a thousand clients that wait."""
+"""Rows about a busy server: goals per second, many pending goals, and a thousand waiting clients."""
 
 from __future__ import annotations
 
@@ -22,36 +22,36 @@ from talkcli.goals.scheduler import Now, Scheduler
 from talkcli.protocol import events
 from talkcli.protocol.lines import encode
 from tests.support import usage
-from tests.tools.bench.stage import serving
+from tests.tools.bench.harness import serving
 from tests.tools.bench.table import Limit, Row
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from tests.tools.bench.stage import Stage
+    from tests.tools.bench.harness import Harness
 
 _PATIENCE_S = 60.0
 _RESULT = b'"event": "result"'
-#: Goals of a round of `throughput`; each ends at once, and reports no word.
+#: Goals per round of `throughput`. Each ends at once, without words.
 GOALS = 2_000
 _TEXT = "length=0 words=0"
-#: The goals a second that are wanted, by the number of connections.
-_BOUNDS = {1: 5_000, 50: 3_000}
+#: Required goals per second, by the number of connections.
+_REQUIRED_RATES = {1: 5_000, 50: 3_000}
 _MOST_ROUNDS = 6
 _BARE = str(Path(__file__).with_name("bare_serve.py"))
 #: Pending goals in the scheduler's queue.
 FEW, MANY = 1_000, 10_000
-#: Pending goals of the server whose memory is measured, and those before them.
+#: Pending goals whose memory is measured, and pending goals before them.
 PENDING, _FIRST = 9_900, 100
-#: Steps that are timed together: one alone is shorter than the clock is exact.
+#: Number of steps that are timed together, because one step is too short for the clock.
 _STEPS = 200
 _SENDER, _NOW = Sender(pid=7, uid=1000, command="talk", name="bench"), Now(100.0, 1.7e9)
-#: Clients that wait for one goal.
+#: Number of clients that wait for one goal.
 CLIENTS = 1_000
 
 
 class Wires(contextlib.ExitStack):
-    """Connections to a server in one thread, which decodes nothing while the time runs."""
+    """Connections to a server in one thread. Nothing is decoded during the measurement."""
 
     def __init__(self, path: str, count: int) -> None:
         super().__init__()
@@ -65,25 +65,25 @@ class Wires(contextlib.ExitStack):
             wire.settimeout(_PATIENCE_S)
             wire.connect(path)
             wire.sendall(b'{"seq": 0, "request": "hello", "name": "bench"}\n')
-            told = b""
-            while told.count(b"\n") < 2:
+            reply = b""
+            while reply.count(b"\n") < 2:
                 data = wire.recv(4096)
-                assert data, f"a connection was refused: {told!r}"
-                told += data
-            assert b'"error"' not in told, told
+                assert data, f"a connection was refused: {reply!r}"
+                reply += data
+            assert b'"error"' not in reply, reply
             self._sockets[wire.fileno()] = wire
             self._poll.register(wire, select.EPOLLIN)
 
-    def exchange(self, data: bytes, wanted: bytes, count: int, began: Callable[[], object] = int) -> float:
-        """Send data on each connection, and return the seconds until each has received `wanted` so many times.
+    def exchange(self, data: bytes, wanted: bytes, count: int, first: Callable[[], object] = int) -> float:
+        """Send data on each connection, and return the seconds until each has received `wanted` `count` times.
 
-        `began` is called first, and counts.
+        `first` is called before, and its time is included.
         """
-        self._received = {each: [] for each in self._sockets}
+        self._received = {number: [] for number in self._sockets}
         missing, tails = dict.fromkeys(self._sockets, count), dict.fromkeys(self._sockets, b"")
         sending = threading.Thread(target=self._send, args=(data,), daemon=True)
         start = time.monotonic()
-        began()
+        first()
         sending.start()
         while missing:
             ready = self._poll.poll(_PATIENCE_S)
@@ -103,62 +103,62 @@ class Wires(contextlib.ExitStack):
         return seconds
 
     def _send(self, data: bytes) -> None:
-        for each in self._sockets.values():
-            each.sendall(data)
+        for wire in self._sockets.values():
+            wire.sendall(data)
 
     def received(self) -> list[dict[str, Any]]:
-        """Return all that was received in the last exchange, decoded."""
-        return [json.loads(line) for each in self._received.values() for line in b"".join(each).splitlines()]
+        """Return all messages of the last exchange."""
+        return [json.loads(line) for pieces in self._received.values() for line in b"".join(pieces).splitlines()]
 
 
-def throughput(stage: Stage) -> list[Row]:
-    """Measure goals a second of talk with an engine that takes no time, and of servers that keep no promise."""
+def throughput(harness: Harness) -> list[Row]:
+    """Measure the goals per second of talk with an engine that takes no time, and of bare servers."""
     rates: dict[tuple[str, int], list[float]] = {}
     with contextlib.ExitStack() as stack:
         servers = {
             "talk": stack.enter_context(serving("--max-queue", str(2 * GOALS), scripted=True)),
             "bare": stack.enter_context(serving(program=_BARE)),
-            "alone": stack.enter_context(serving("--alone", program=_BARE)),
+            "no engine": stack.enter_context(serving("--no-engine", program=_BARE)),
         }
-        for number in range(min(_MOST_ROUNDS, stage.options.rounds) + 1):
-            for connections in _BOUNDS:
+        for number in range(min(_MOST_ROUNDS, harness.options.rounds) + 1):
+            for connections in _REQUIRED_RATES:
                 for name, talk in servers.items():
-                    rate = _goals_a_second(talk.socket, connections)
-                    if number:  # the first warms up
+                    rate = _goals_per_second(talk.socket, connections)
+                    if number:  # the first round only warms up
                         rates.setdefault((name, connections), []).append(rate)
     rows = []
-    for connections, bound in _BOUNDS.items():
-        ours, floor, alone = (rates[name, connections] for name in servers)
+    for connections, bound in _REQUIRED_RATES.items():
+        talk_rates, bare_rates, no_engine_rates = (rates[name, connections] for name in servers)
         over = f"{connections} connection{'s' * (connections > 1)}"
         limit = Limit("median", bound, at_least=True)
         name = "… the bare server, without or with an engine process"
         rows += [
-            Row(f"goals accepted, queued and ended: {over}", "/s", ours, "bare server", floor, (limit,)),
-            Row(f"{name}: {over}", "/s", alone, "bare", floor),
+            Row(f"goals accepted, queued and ended: {over}", "/s", talk_rates, "bare server", bare_rates, (limit,)),
+            Row(f"{name}: {over}", "/s", no_engine_rates, "bare", bare_rates),
         ]
     return rows
 
 
-def _goals_a_second(path: str, connections: int) -> float:
-    each = GOALS // connections
+def _goals_per_second(path: str, connections: int) -> float:
+    count = GOALS // connections
     with Wires(path, connections) as wires:
-        seconds = wires.exchange(_says([_TEXT] * each, wait=True), _RESULT, each)
+        seconds = wires.exchange(_say_requests([_TEXT] * count, wait=True), _RESULT, count)
         ends = [line["goal"]["state"] for line in wires.received() if line.get("event") == "result"]
-    assert ends == ["SUCCEEDED"] * (each * connections), f"{ends.count('SUCCEEDED')} of {each * connections} goals"
-    return each * connections / seconds
+    assert ends == ["SUCCEEDED"] * (count * connections), f"{ends.count('SUCCEEDED')} of {count * connections} goals"
+    return count * connections / seconds
 
 
-def _says(texts: Iterable[str], **fields: object) -> bytes:
+def _say_requests(texts: Iterable[str], **fields: object) -> bytes:
     return b"".join(encode({"seq": n, "request": "say", "text": text, **fields}) for n, text in enumerate(texts, 1))
 
 
 class BusyScheduler:
-    """A scheduler with many pending goals, and the steps whose cost is measured."""
+    """A scheduler with many pending goals, and the steps that are measured."""
 
     def __init__(self, size: int) -> None:
         self._scheduler = Scheduler("4k7f", max_queue=size + _STEPS + 1)
         self._numbers = count()
-        for _ in range(size + 1):  # the first is being spoken
+        for _ in range(size + 1):  # the first goal is active
             self._enqueue()
 
     def _enqueue(self) -> None:
@@ -167,11 +167,11 @@ class BusyScheduler:
         self._scheduler.submit(say, _SENDER, _NOW)
 
     def times(self) -> dict[str, float]:
-        """Return the microseconds of each step; as many goals are pending afterwards as before."""
+        """Return the microseconds of each step. The number of pending goals doesn't change."""
         enqueue = _microseconds(repeat(self._enqueue, _STEPS))
         first = (len(self._scheduler.pending) - _STEPS) // 2
-        chosen = [each.id for each in islice(self._scheduler.pending, first, first + _STEPS)]
-        steps = [partial(self._scheduler.cancel, Cancel((each,)), _SENDER, _NOW) for each in chosen]
+        chosen = [goal.id for goal in islice(self._scheduler.pending, first, first + _STEPS)]
+        steps = [partial(self._scheduler.cancel, Cancel((goal_id,)), _SENDER, _NOW) for goal_id in chosen]
         cancel = _microseconds(steps)
         records = iter(self._scheduler.pending)
         line = lambda: encode(events.item(1, pending=next(records).snapshot().to_json()))  # noqa: E731
@@ -180,25 +180,25 @@ class BusyScheduler:
 
 
 def _microseconds(steps: Iterable[Callable[[], object]]) -> float:
-    began = time.perf_counter()
+    started_at = time.perf_counter()
     for step in steps:
         step()
-    return (time.perf_counter() - began) / _STEPS * 1e6
+    return (time.perf_counter() - started_at) / _STEPS * 1e6
 
 
-def queue(stage: Stage) -> list[Row]:
-    """Measure each step with few goals pending and with many; then the memory of a pending goal."""
+def queue(harness: Harness) -> list[Row]:
+    """Measure each step with few and with many pending goals, and the memory of a pending goal."""
     few, many = BusyScheduler(FEW), BusyScheduler(MANY)
     gc.collect()
-    gc.disable()  # a collection would fall into one step or another
+    gc.disable()  # a collection would delay some steps
     try:
-        turns = [(few.times(), many.times()) for _ in range(stage.options.rounds * 3)]
+        rounds = [(few.times(), many.times()) for _ in range(harness.options.rounds * 3)]
     finally:
         gc.enable()
     rows = []
-    for step in turns[0][0]:
+    for step in rounds[0][0]:
         name, limit = f"{step}, {MANY:,} waiting goals", Limit("ratio", 1.5)
-        with_few, with_many = ([turn[place][step] for turn in turns] for place in (0, 1))
+        with_few, with_many = ([result[index][step] for result in rounds] for index in (0, 1))
         rows.append(Row(name, "µs", with_many, f"{FEW:,} waiting", with_few, (limit,)))
     size, limit = _memory_of_a_goal(), Limit("median", 1024)
     return [*rows, Row("memory of a waiting goal, in the server", "B", [size], limits=(limit,))]
@@ -206,24 +206,24 @@ def queue(stage: Stage) -> list[Row]:
 
 def _memory_of_a_goal() -> float:
     with serving("--max-queue", str(PENDING + _FIRST), scripted=True) as talk, Wires(talk.socket, 1) as wires:
-        texts = ["never-ends", *(f"goal {each} is waiting" for each in range(PENDING + _FIRST))]
-        wires.exchange(_says(texts[: _FIRST + 1]), b'"ok"', _FIRST + 1)
+        texts = ["never-ends", *(f"goal {number} is waiting" for number in range(PENDING + _FIRST))]
+        wires.exchange(_say_requests(texts[: _FIRST + 1]), b'"ok"', _FIRST + 1)
         before = usage.count(talk.pid).memory
-        wires.exchange(_says(texts[_FIRST + 1 :]), b'"ok"', PENDING)
+        wires.exchange(_say_requests(texts[_FIRST + 1 :]), b'"ok"', PENDING)
         grown = usage.count(talk.pid).memory - before
         talk.request("cancel")
     return grown * 1024 / PENDING
 
 
-def crowd(stage: Stage) -> list[Row]:
-    """Measure how soon the last of many waiting clients knows that their goal has ended."""
+def crowd(harness: Harness) -> list[Row]:
+    """Measure the time until the last of many waiting clients has the result."""
     with serving("--max-clients", str(CLIENTS + 100), scripted=True) as talk:
-        times = stage.in_turn({"all": partial(_last_to_know, talk.socket)}, min(10, stage.options.rounds))
+        times = harness.in_turn({"all": partial(_last_result, talk.socket)}, min(10, harness.options.rounds))
     name, limit = f"{CLIENTS:,} waiting clients: cancel → result at the last client", Limit("median", 50)
     return [Row(name, "ms", times["all"], limits=(limit,))]
 
 
-def _last_to_know(path: str) -> float:
+def _last_result(path: str) -> float:
     with Client(path) as client, Wires(path, CLIENTS) as wires:
         goal = client.say("never-ends")
         wait = encode({"seq": 1, "request": "wait", "ids": [goal.id]})

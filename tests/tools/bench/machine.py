@@ -1,4 +1,4 @@
-"""The machine under the benchmark: its versions, and the memory and processor time that processes take."""
+"""Facts about the benchmark's machine, and the memory and processor time of processes."""
 
 from __future__ import annotations
 
@@ -17,86 +17,85 @@ from tests.support.surroundings import find_program
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-#: The programs whose versions are shown, and the option that each tells it for.
+#: The programs whose versions are shown, with their options for it.
 _PROGRAMS = {
     **dict.fromkeys(("espeak-ng", "speech-dispatcher", "aplay", "pulseaudio"), "--version"),
     "mosquitto": "-h",
 }
 _PACKAGES = ("talkcli", "click", "pyttsx3", "paho-mqtt")
-#: Seconds without a context switch after which a server is idle, and seconds to wait for that.
-_STILL_S, _PATIENCE_S = 1.0, 15.0
+#: Time without context switches after which a server is idle, and time limit for this.
+_IDLE_S, _IDLE_LIMIT_S = 1.0, 15.0
 
 
-def head() -> dict[str, str]:
-    """Return the names and versions that belong above a table."""
-    found = {
+def describe() -> dict[str, str]:
+    """Return facts about the machine, with the versions of programs and packages."""
+    facts = {
         "processor": _processor(),
         "cores": str(len(os.sched_getaffinity(0))),
         "system": f"{platform.system()} {platform.machine()}",
         "load average": load(),
         "Python": platform.python_version(),
     }
-    return found | {each: version(each) for each in _PACKAGES} | {each: _program(each) for each in _PROGRAMS}
+    return facts | {name: version(name) for name in _PACKAGES} | {name: _program_version(name) for name in _PROGRAMS}
 
 
 def load() -> str:
     """Return the load average of the last 1, 5 and 15 minutes."""
-    return " ".join(f"{each:.1f}" for each in os.getloadavg())
+    return " ".join(f"{value:.1f}" for value in os.getloadavg())
 
 
 @dataclass(frozen=True, slots=True)
-class Taken:
-    """The context switches and the seconds of processor time of some processes, with all their threads."""
+class ProcessorUse:
+    """Context switches and processor time (in seconds) of processes with all their threads."""
 
     switches: int
     processor: float
 
-    def since(self, before: Taken) -> Taken:
-        """Return the difference to an earlier count."""
-        return Taken(self.switches - before.switches, self.processor - before.processor)
+    def since(self, before: ProcessorUse) -> ProcessorUse:
+        return ProcessorUse(self.switches - before.switches, self.processor - before.processor)
 
 
-def taken(pids: Iterable[int]) -> Taken:
-    """Count the context switches, voluntary or not, and the processor time of these processes so far."""
+def processor_use(pids: Iterable[int]) -> ProcessorUse:
+    """Return all context switches and the processor time of these processes so far."""
     switches, processor = 0, 0.0
     for pid in pids:
         for thread in os.listdir(f"/proc/{pid}/task"):
             with open(f"/proc/{pid}/task/{thread}/status", encoding="utf-8") as status:
                 switches += sum(int(line.split()[1]) for line in status if "ctxt_switches:" in line)
             processor += _seconds(f"/proc/{pid}/task/{thread}")
-    return Taken(switches, processor)
+    return ProcessorUse(switches, processor)
 
 
-def taken_in(pids: Iterable[int], seconds: float) -> Taken:
-    """Return what these processes take in so many seconds, after they have become idle."""
+def measure_use(pids: Iterable[int], seconds: float) -> ProcessorUse:
+    """Wait until these processes are idle, and return their processor use during some seconds."""
     pids = list(pids)
     settle(pids)
-    before = taken(pids)
+    before = processor_use(pids)
     time.sleep(seconds)
-    return taken(pids).since(before)
+    return processor_use(pids).since(before)
 
 
 def settle(pids: Iterable[int]) -> None:
-    """Wait until these processes are idle: a server still has work for a while after its last client."""
+    """Wait until these processes are idle, because a server still works for a while after its last client."""
     pids = list(pids)
-    end = time.monotonic() + _PATIENCE_S
+    end = time.monotonic() + _IDLE_LIMIT_S
     while time.monotonic() < end:
-        before = taken(pids)
-        time.sleep(_STILL_S)
-        if taken(pids).since(before).switches == 0:
+        before = processor_use(pids)
+        time.sleep(_IDLE_S)
+        if processor_use(pids).since(before).switches == 0:
             return
 
 
 def megabytes(pid: int, kind: str) -> float:
-    """Return the memory of a process: "Rss" is all of it, "Pss" divides shared memory among its users."""
+    """Return the memory of a process. "Rss" is all memory. "Pss" counts only its share of shared memory."""
     with open(f"/proc/{pid}/smaps_rollup", encoding="utf-8") as file:
-        return next(int(each.split()[1]) for each in file if each.startswith(f"{kind}:")) / 1024
+        return next(int(line.split()[1]) for line in file if line.startswith(f"{kind}:")) / 1024
 
 
 def _seconds(task: str) -> float:
     with contextlib.suppress(OSError), open(f"{task}/schedstat", encoding="ascii") as file:
         return int(file.read().split()[0]) / 1e9
-    with open(f"{task}/stat", encoding="utf-8") as file:  # to a hundredth of a second, if the kernel counts no finer
+    with open(f"{task}/stat", encoding="utf-8") as file:  # only precise to 10 ms
         fields = file.read().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
@@ -107,10 +106,10 @@ def _processor() -> str:
     return names[0] if names else platform.processor() or "unknown"
 
 
-def _program(name: str) -> str:
+def _program_version(name: str) -> str:
     path = find_program(name)
     if path is None:
         return "not installed"
     done = subprocess.run([path, _PROGRAMS[name]], capture_output=True, text=True, timeout=20, check=False)
-    found = re.search(r"\d+(\.\d+)+", done.stdout + done.stderr)
-    return found.group() if found else "unknown"
+    match = re.search(r"\d+(\.\d+)+", done.stdout + done.stderr)
+    return match.group() if match else "unknown"

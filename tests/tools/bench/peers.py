@@ -1,4 +1,4 @@
-"""A private speech-dispatcher with its own directory, socket and settings, which plays into a sink of the benchmark."""
+"""A private speech-dispatcher that plays to the benchmark's sink."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ DefaultModule espeak-ng
 DefaultVolume 100
 DisableAutoSpawn
 """
-#: Debian's settings, except for the rate: talk, espeak-ng and pyttsx3 speak as fast as this here.
+#: Debian's settings, except for the rate, which is the same as for talk, espeak-ng and pyttsx3.
 _MODULE = """\
 Debug 0
 EspeakMinRate 80
@@ -45,21 +45,20 @@ EspeakMbrola 0
 
 
 def installed() -> bool:
-    """Return whether all peers are installed."""
     return all(map(shutil.which, PROGRAMS))
 
 
 @contextlib.contextmanager
 def dispatcher(sink: Sink) -> Iterator[dict[str, str]]:
-    """Run a speech-dispatcher until the end of the block; yield the variable by which `spd-say` finds it."""
+    """Run speech-dispatcher during the block. Yield the variable with which `spd-say` finds it."""
     mark = uuid.uuid4().hex
     with short_directory("spd-") as home:
         Path(home, "modules").mkdir()
         Path(home, "speechd.conf").write_text(_SETTINGS.format(directory=home))
         Path(home, "modules", "espeak-ng.conf").write_text(_MODULE)
         address = f"{home}/s.sock"
-        found = {"SPEECHD_ADDRESS": f"unix_socket:{address}"}
-        env = clean_environment(home, {**sink.env, **found, MARK: mark})
+        variable = {"SPEECHD_ADDRESS": f"unix_socket:{address}"}
+        env = clean_environment(home, {**sink.env, **variable, MARK: mark})
         command = ["speech-dispatcher", "-s", "-t", "0", "-C", home, "-S", address, "-P", f"{home}/pid"]
         with open(f"{home}/log", "wb") as log:
             process = subprocess.Popen(
@@ -70,10 +69,10 @@ def dispatcher(sink: Sink) -> Iterator[dict[str, str]]:
             while not os.path.exists(address):
                 running = process.poll() is None and time.monotonic() < end
                 assert running, f"speech-dispatcher does not start: {Path(home, 'log').read_text()[-1000:]}"
-                time.sleep(0.02)  # a socket's appearance is no event
-            yield found
+                time.sleep(0.02)  # a new socket sends no event
+            yield variable
         finally:
             process.kill()
             process.wait()
-            with contextlib.suppress(AssertionError):  # its modules are killed if they do not end with it
+            with contextlib.suppress(AssertionError):  # kills its modules if they don't end with it
                 assert_none_left(mark, 2.0)

@@ -1,4 +1,4 @@
-"""The rows of the benchmark, their goals, and the table that shows them."""
+"""The benchmark's rows with their goals, and the table that shows them."""
 
 from __future__ import annotations
 
@@ -16,31 +16,30 @@ HEADINGS = ("from → to", "n", "median", "99th", "peer", "peer's median", "rati
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """The highest value that a figure of a row may have, or the lowest."""
+    """The highest allowed value of a row's figure, or the lowest with `at_least`."""
 
     figure: Figure
     bound: float
     at_least: bool = False
 
     def holds(self, value: float) -> bool:
-        """Return whether a figure is within the limit."""
         return value >= self.bound if self.at_least else value <= self.bound
 
-    def words(self, unit: str) -> str:
+    def text(self, unit: str) -> str:
         """Return the limit as the table shows it."""
-        behind = {
+        suffixes = {
             "median": unit,
             "p99": f"{unit} 99th",
             "least": f"{unit} each",
             "above": f"{unit} above",
             "ratio": "×",
         }
-        return f"{'≥' if self.at_least else '≤'} {number(self.bound)} {behind[self.figure]}"
+        return f"{'≥' if self.at_least else '≤'} {number(self.bound)} {suffixes[self.figure]}"
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """The values that were measured, and those of a peer that was measured in turn with them."""
+    """The measured values of a subject and of its peer."""
 
     name: str
     unit: str
@@ -52,45 +51,44 @@ class Row:
 
     @property
     def figures(self) -> dict[Figure, float]:
-        """The figures of the values; without a peer there is no ratio and no difference."""
-        middle = statistics.median(self.values)
-        found: dict[Figure, float] = {"median": middle, "p99": percentile(self.values, 99), "least": min(self.values)}
+        """The figures of the values. A peer is needed for the ratio and the difference."""
+        median = statistics.median(self.values)
+        figures: dict[Figure, float] = {"median": median, "p99": percentile(self.values, 99), "least": min(self.values)}
         if self.peer_values:
-            theirs = statistics.median(self.peer_values)
-            found |= {"ratio": middle / theirs, "above": middle - theirs}
-        return found
+            peer_median = statistics.median(self.peer_values)
+            figures |= {"ratio": median / peer_median, "above": median - peer_median}
+        return figures
 
     @property
     def goal(self) -> str:
-        """The limits in words."""
-        return ", ".join(each.words(self.unit) for each in self.limits)
+        return ", ".join(limit.text(self.unit) for limit in self.limits)
 
     @property
     def met(self) -> str:
-        """Whether all limits hold: "yes" or "no"; "" if there is no limit, or no peer to compare with."""
+        """Whether all limits hold: "yes", "no", or "" without limits or without a peer for them."""
         figures = self.figures
-        if not self.limits or any(each.figure not in figures for each in self.limits):
+        if not self.limits or any(limit.figure not in figures for limit in self.limits):
             return ""
-        return "yes" if all(each.holds(figures[each.figure]) for each in self.limits) else "no"
+        return "yes" if all(limit.holds(figures[limit.figure]) for limit in self.limits) else "no"
 
     def cells(self) -> list[str]:
         """Return the text under each heading."""
         if self.failure is not None:
             return [self.name, "0", f"FAILED: {self.failure}", "", "", "", "", self.goal, "no"]
         figures = self.figures
-        theirs = ["", "", ""]
+        peer = ["", "", ""]
         if self.peer_values:
-            theirs = [
+            peer = [
                 self.peer,
                 f"{number(statistics.median(self.peer_values))} {self.unit}",
                 f"{figures['ratio']:.2f}",
             ]
         own = [f"{len(self.values):,}", f"{number(figures['median'])} {self.unit}".strip(), number(figures["p99"])]
-        return [self.name, *own, *theirs, self.goal, self.met]
+        return [self.name, *own, *peer, self.goal, self.met]
 
 
 def percentile(values: Sequence[float], percent: float) -> float:
-    """Return the smallest measured value that so many percent of the values do not exceed."""
+    """Return the smallest value that `percent` percent of the values don't exceed."""
     ordered = sorted(values)
     return ordered[max(0, math.ceil(len(ordered) * percent / 100) - 1)]
 
@@ -107,10 +105,10 @@ def number(value: float) -> str:
 
 
 def as_table(rows: Sequence[Row]) -> str:
-    """Return the rows as a Markdown table whose columns are aligned, except for the reasons of failures."""
-    lines = [list(HEADINGS), ["---"] * len(HEADINGS), *(each.cells() for each in rows)]
-    fitting = [line for line in lines if not line[2].startswith("FAILED")]
-    widths = [max(len(line[column]) for line in fitting) for column in range(len(HEADINGS))]
+    """Return the rows as a Markdown table. Its columns are aligned, except for failed rows."""
+    lines = [list(HEADINGS), ["---"] * len(HEADINGS), *(row.cells() for row in rows)]
+    aligned = [line for line in lines if not line[2].startswith("FAILED")]
+    widths = [max(len(line[column]) for line in aligned) for column in range(len(HEADINGS))]
     return "\n".join(
         f"| {' | '.join(f'{cell:<{width}}' for cell, width in zip(line, widths, strict=True))} |" for line in lines
     )

@@ -40,7 +40,10 @@ class Stopped(Exception):
 
 
 class CannotEnd(Exception):
-    """Raised if a player couldn't be killed. The engine process must exit, because it can't guarantee silence."""
+    """Raised if a player couldn't be killed.
+
+    The engine process must exit, because it can't guarantee silence.
+    """
 
 
 class Player(Protocol):
@@ -77,7 +80,7 @@ class Player(Protocol):
         return None
 
     def offer(self, data: memoryview) -> int:
-        """Accept as many samples as there is room for.
+        """Accept as many samples as there is room for, and return the number of bytes accepted.
 
         Args:
             data: Between one byte and one piece of samples. The caller reuses this buffer after the call.
@@ -106,27 +109,31 @@ class Player(Protocol):
         return None
 
     def close(self) -> None:
-        """Accept no more samples, and let the accepted ones play to the end. Return without waiting.
+        """Accept no more samples, and let the accepted ones play to the end.
+
+        Return without waiting.
 
         Raises:
             CannotSpeak: The accepted samples can't be played to the end.
         """
 
     def ended(self) -> bool:
-        """Return whether the player was closed and has played everything successfully.
+        """Return whether the player was closed and has played everything.
+
+        Raise CannotSpeak if it has failed.
 
         Raises:
             CannotSpeak: The player failed. This is also raised before `close`, even if no samples are offered.
         """
 
     def interests(self) -> Sequence[Interest]:
-        """Return the open descriptors to poll for room, a failure or the end, each with its poll events.
+        """Return the descriptors to poll, each with its poll events.
 
         The playback ignores descriptors that only wait for POLLOUT while it has no samples to offer.
         """
 
     def wake_at(self) -> float:
-        """Return the monotonic time at which to check the player again, or NEVER if its descriptors are enough."""
+        """Return when to check the player again, or NEVER if polling is enough."""
 
     def kill(self) -> None:
         """Stop playing at once, and start to release all resources.
@@ -135,7 +142,7 @@ class Player(Protocol):
         """
 
     def gone(self) -> bool:
-        """Return whether the player is certainly silent and has released its descriptors, processes and threads.
+        """Return whether the player is silent and has released its resources.
 
         It is called every 20 ms after `kill`. If it still returns False after one second, the engine process exits.
         """

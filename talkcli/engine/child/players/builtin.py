@@ -1,4 +1,4 @@
-"""Players that need neither a program nor a sound server: "null", "file:PATH", and `talk say --output`."""
+"""Players that need neither a program nor a sound server."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _MAX_WAV_BYTES = _UNKNOWN_BYTES - _WAV_HEADER.size
 
 
 class BuiltInPlayer(Player):
-    """Base class of players that process samples at once and have nothing to release."""
+    """Base class of players that process samples at once."""
 
     proven = True
 
@@ -72,7 +72,7 @@ class BuiltInPlayer(Player):
 
 
 class NullPlayer(BuiltInPlayer):
-    """Accepts samples as slowly as a loudspeaker would play them, but makes no sound.
+    """A player that consumes samples in real time but makes no sound.
 
     This player is for simulated robots and for CI, where scripts have to keep their timing.
     """
@@ -89,7 +89,10 @@ class NullPlayer(BuiltInPlayer):
         self._end_time = 0.0
 
     def offer(self, data: memoryview) -> int:
-        """Accept all of the samples if the simulated buffer has room for them, otherwise none."""
+        """Accept all samples if the simulated buffer has room, otherwise none.
+
+        Return the number of bytes accepted.
+        """
         now = self._clock()
         end = max(now, self._end_time) + len(data) / self._bytes_per_second
         if end > now + NULL_AHEAD_S:
@@ -99,11 +102,11 @@ class NullPlayer(BuiltInPlayer):
         return len(data)
 
     def ended(self) -> bool:
-        """Return whether the player was closed and all accepted samples would have been heard."""
+        """Return whether the player was closed and its simulated buffer is empty."""
         return self._closed and self._clock() >= self._end_time
 
     def wake_at(self) -> float:
-        """Return the time at which the simulated buffer has room or, after `close`, is empty."""
+        """Return when the simulated buffer has room or, after `close`, is empty."""
         # At this time, a third of the buffer is free, so this player wakes up no more often than a real one.
         return self._end_time if self._closed else self._end_time - NULL_AHEAD_S * 2 / 3
 
@@ -160,7 +163,7 @@ class WavPlayer(BuiltInPlayer):
                 os.close(self._file)  # some network file systems report a full disk or an exceeded quota only here
 
     def kill(self) -> None:
-        """Keep the samples written so far, close the file, and ignore any error."""
+        """Close the file, and keep the samples written so far."""
         with contextlib.suppress(CannotSpeak):  # the sentence was stopped, or has already failed with another error
             self.close()
 
@@ -181,13 +184,16 @@ class WavStreamPlayer(BuiltInPlayer):
     name = OUTPUT_STREAM_NAME
 
     def __init__(self, output: int, rate: int, *, first: bool) -> None:
-        """Open the player for a descriptor. If this is the `first` sentence, write a header before it."""
+        """Open the player for a descriptor.
+
+        If this is the `first` sentence, write a header before it.
+        """
         super().__init__()
         self._output = output
         self._header = _WAV_HEADER.pack(*_header_fields(rate, _UNKNOWN_BYTES)) if first else b""
 
     def offer(self, data: memoryview) -> int:
-        """Write the samples if the output has room, and return the number of sample bytes written."""
+        """Write the samples if the output has room, and return the number of bytes written."""
         # A writable pipe has room for at least a header and a piece of samples.
         if not wait_ready({self._output: select.POLLOUT}, 0.0):
             return 0
@@ -199,11 +205,11 @@ class WavStreamPlayer(BuiltInPlayer):
         return written - header
 
     def interests(self) -> list[Interest]:
-        """Return the output's descriptor, to be polled for room."""
+        """Return the descriptor of the output."""
         return [(self._output, select.POLLOUT)]
 
     def wake_at(self) -> float:
-        """Return NEVER, because the output's descriptor reports when there is room."""
+        """Return NEVER, because polling the output is enough."""
         return NEVER
 
 
@@ -217,7 +223,9 @@ def _convert_os_errors(reason: Reason, subject: str) -> Iterator[None]:
 
 
 def _open_regular_file(path: str) -> int:
-    """Open a file for reading and writing, and return its descriptor. Create the file if it doesn't exist.
+    """Open a file for reading and writing, and return its descriptor.
+
+    Create the file if it doesn't exist.
 
     Raises:
         CannotSpeak: The path is empty, or isn't that of a regular file.
@@ -240,7 +248,7 @@ def _header_fields(rate: int, sample_bytes: int) -> tuple[bytes | int, ...]:
 
 
 def _read_sample_bytes(file: int, path: str, rate: int) -> int:
-    """Read the number of sample bytes from a file's WAV header, or return 0 if the file is empty.
+    """Read the number of sample bytes from a file's WAV header.
 
     Raises:
         CannotSpeak: The file wasn't written by a `WavPlayer` with this sample rate.

@@ -33,21 +33,19 @@ _AUTOMATIC_CLASSES = [name for name, each in PLAYERS.items() if each.automatic a
 #: silence doesn't count as sound, because some loudspeakers switch off when they receive only silence.
 IDLE_AFTER_S = 1.0
 
-#: The number of handovers to remember for each player. Their median, which a single slow handover doesn't affect,
-#: predicts the next one.
+#: The number of handovers to remember for each player. Their median predicts the next one.
 MAX_HANDOVERS = 5
 
 #: Maximum seconds of silence to cut. This is half of the pause after a sentence. The other half is kept, so that the
 #: sentences stay separate.
 MAX_CUT_S = 0.12
 
-#: Handovers that take more than this many seconds aren't counted. In these cases, the waiting goal was canceled or
-#: paused, and another goal followed later.
+#: Longer handovers, in seconds, aren't counted, because the waiting goal was probably cancelled or paused.
 MAX_HANDOVER_S = 0.5
 
 
 class HandoverTimes:
-    """Measures the delays between sentences, and decides how much silence to cut to make up for them.
+    """Measures the delays between sentences, and makes up for them by cutting silence.
 
     A handover is the time between the last sample of one sentence and the first sample of the next. During a handover,
     the player drains and exits, the server gets the result, and the next sentence starts. This would lengthen the pause
@@ -72,23 +70,23 @@ class HandoverTimes:
         return self._previous is not None
 
     def silence_to_cut(self, player_name: str) -> float:
-        """Return how many seconds of silence to cut from the end of a sentence with this player."""
+        """Return how many seconds of silence to cut from the end of a sentence."""
         measured = sorted(self._measured.get((player_name, self.next_is_neural), ()))
         return min(MAX_CUT_S, measured[len(measured) // 2]) if measured else 0.0
 
     def sentence_ended(self, player_name: str, last_sample_at: float) -> None:
-        """If another goal is waiting, record when the last sample of the completed sentence is heard."""
+        """Record when the last sample of a completed sentence is heard."""
         self._previous = (player_name, last_sample_at) if self.next_waits else None
 
     def sentence_started(self, player_name: str, at: float, *, neural: bool = False) -> None:
-        """Record the delay since the end of the previous sentence, if this one was waiting then."""
+        """Record the delay since the previous sentence, if this one was already waiting."""
         previous, self._previous = self._previous, None
         if previous is not None and previous[0] == player_name and 0 < at - previous[1] < MAX_HANDOVER_S:
             self._measured.setdefault((player_name, neural), deque(maxlen=MAX_HANDOVERS)).append(at - previous[1])
 
 
 class PlayerChooser:
-    """Opens the players of an engine process, and records the output of the current sentence.
+    """Opens the players of an engine process.
 
     Args:
         configure: The settings of the engine process, such as the player and the device.
@@ -120,7 +118,7 @@ class PlayerChooser:
         self.silent_since: float | None = None
 
     def candidates(self, rate: int) -> Iterator[Callable[[], Player]]:
-        """Yield functions that each open and return a player to try, best first.
+        """Yield functions that open the players to try, best first.
 
         Programs are searched for only after the players in this process have been tried.
         """
@@ -139,14 +137,19 @@ class PlayerChooser:
         yield from (partial(ProgramPlayer, command, self._inherited) for command in found)
 
     def begin(self, command: Speak) -> None:
-        """Store the settings that a `Speak` command has for its sentence, and forget the previous output."""
+        """Store the player settings of a `Speak` command."""
         self._own_lead_in = command.lead_in
         self._audible = self._configure.audible if command.audible is None else command.audible
         self.output = None
         self.handovers.next_waits, self.handovers.next_is_neural = command.next_waits, command.next_is_neural
 
     def update_output(self, player: Player) -> None:
-        """Record a player's output and, if it works, its name. A sentence that was ever muted counts as muted."""
+        """Record the output of a player.
+
+        If the player was chosen automatically and works, also record its name.
+
+        A sentence that was ever muted counts as muted.
+        """
         if player.proven and self._configure.player is None:
             self.last_player = player.name
         output, before = player.output, self.output
@@ -158,7 +161,7 @@ class PlayerChooser:
             self.output = None  # the new player doesn't know its output
 
     def lead_in_seconds(self, at_beginning: bool = True) -> float:
-        """Return how many seconds of silence a newly opened player has to play before its samples.
+        """Return how many seconds of silence a new player must play first.
 
         Args:
             at_beginning: Whether the player plays the beginning of the sentence. Otherwise, it continues the sentence
@@ -170,7 +173,7 @@ class PlayerChooser:
         return milliseconds / 1000 if due else 0.0
 
     def find_first_player(self) -> str | None:
-        """Return the name of the player that would be tried first, or None if there is no player.
+        """Return the name of the player that would be tried first.
 
         To test the players that run in this process, open and close them.
         """
@@ -196,7 +199,7 @@ class PlayerChooser:
 
 
 def _open_in_process(name: str, rate: int, device: str | None = None, audible: bool = False) -> Player:
-    """Open a player that runs in this process, given its name in PLAYERS."""
+    """Open a player that runs in this process, by its name."""
     module, _, member = PLAYERS[name].class_path.partition(":")
     player_class = getattr(import_module(f"talkcli.engine.child.players.{module}"), member)
     player: Player = player_class(rate, device, audible)
@@ -204,5 +207,5 @@ def _open_in_process(name: str, rate: int, device: str | None = None, audible: b
 
 
 def _raise_error(error: CannotSpeak) -> Player:
-    """Raise the error. This takes the place of a function that opens a player."""
+    """Raise an error instead of opening a player."""
     raise error

@@ -1,4 +1,4 @@
-"""Bindings for the parts of libpulse that a player needs, and a main loop that never blocks.
+"""Bindings for libpulse, and a main loop that never blocks.
 
 An iteration of libpulse's main loop consists of prepare, poll and dispatch. A program can replace the poll function.
 Ours stores the descriptors and the timeout that libpulse wants to wait for, and polls without waiting. The loop is
@@ -76,7 +76,10 @@ class BufferSizes(Structure):
 
 
 class SinkInfo(Structure):
-    """The first fields of the C structure `pa_sink_info`. Later versions of libpulse only append fields."""
+    """The first fields of the C structure `pa_sink_info`.
+
+    Later versions of libpulse only append fields.
+    """
 
     _fields_ = [
         ("name", c_char_p),
@@ -125,7 +128,7 @@ ChangeCallback = CFUNCTYPE(None, c_void_p, c_int, c_uint32, c_void_p)
 SinkCallback = CFUNCTYPE(None, c_void_p, POINTER(SinkInfo), c_int, c_void_p)
 SinkInputCallback = CFUNCTYPE(None, c_void_p, POINTER(SinkInputInfo), c_int, c_void_p)
 
-#: The libpulse functions that the player uses, without the prefix "pa_", and the types of their results and arguments.
+#: The types of the results and arguments of libpulse's functions, by name without the prefix "pa_".
 _SIGNATURES: tuple[tuple[str, Any, list[Any]], ...] = (
     ("mainloop_new", c_void_p, []),
     ("mainloop_free context_disconnect context_unref operation_unref stream_unref", None, [c_void_p]),
@@ -157,7 +160,7 @@ _SIGNATURES: tuple[tuple[str, Any, list[Any]], ...] = (
 
 @cache
 def load() -> Any:
-    """Load libpulse, and return an object with its functions, without the prefix "pa_", and the C library's `poll`.
+    """Load libpulse, and return an object with its functions.
 
     Raises:
         OSError: libpulse can't be loaded.
@@ -191,16 +194,16 @@ class MainLoop:
 
     def iterate(self) -> bool:
         """Run one iteration without waiting, and return whether it did any work."""
-        # The 1 asks libpulse to wait, so it passes the time until its next timer to `_poll`.
+        # If the second argument is 1, libpulse tells `_poll` how long it is until the next timer.
         return not self.freed and bool(self._library.mainloop_iterate(self._pointer, 1, None) > 0)
 
     def free(self) -> None:
-        """Free the loop, after its contexts have been released."""
+        """Free the loop. Its contexts must be released first."""
         self._library.mainloop_free(self._pointer)
         self.freed, self.interests, self.wake_at = True, [], NEVER
 
     def _poll(self, wanted: Any, count: int, timeout: int, _: object) -> int:
-        """Store what libpulse wants to wait for, poll without waiting, and return the number of ready descriptors."""
+        """Poll without waiting, and store what libpulse wants to wait for."""
         self.interests = [(wanted[number].fd, wanted[number].events) for number in range(count)]
         self.wake_at = NEVER if timeout < 0 else time.monotonic() + timeout / 1000
         return max(0, int(self._library.poll(wanted, count, 0)))  # libpulse would abort the process after an error

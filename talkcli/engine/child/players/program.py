@@ -92,7 +92,7 @@ class PlayerProcess:
             OSError: The program can't be started.
         """
         (stdin, our_stdin), (our_stderr, stderr), (tied, leash) = open_pipes(3)
-        #: our non-blocking ends of the program's standard input and standard error
+        #: our non-blocking ends of the pipes to the program
         self.stdin, self.stderr = io.FileIO(our_stdin, "w"), io.FileIO(our_stderr)
         self._leash = io.FileIO(leash, "w")
         #: a file that becomes readable when the program exits; None on macOS and on Linux before 5.3
@@ -114,10 +114,12 @@ class PlayerProcess:
             self.exit = io.FileIO(os.pidfd_open(self.pid))
 
     def poll(self) -> int | None:
-        """Reap the program if it has exited, and kill what it left. Return its exit status, or None if it is running.
+        """Return the exit status, or None while the program runs.
 
-        If a signal killed the program, the status is the negative number of the signal. The program counts as running
-        until all processes that it has started have exited.
+        After its exit, kill all processes that it started.
+
+        This also reaps the program. If a signal killed it, the status is the negative number of the signal. The program
+        counts as running until all processes that it has started have exited.
         """
         if self._status is None:
             if hasattr(os, "waitid"):  # missing on macOS before Python 3.13
@@ -151,7 +153,10 @@ class PlayerProcess:
             wait.poll(seconds * 1000)
 
     def release(self) -> None:
-        """Close all descriptors of a program that has been reaped. May be called again."""
+        """Close all descriptors of a program that has been reaped.
+
+        Calling this again does nothing.
+        """
         for each in filter(None, (self.stdin, self.stderr, self._leash, self.exit)):
             each.close()
 
@@ -176,7 +181,7 @@ def _spawn(argv: tuple[str, ...], stdin: int, stderr: int, inherited: Sequence[i
 
 
 def _attach_leash(leash: int, group: int) -> None:
-    """Make the kernel kill a process group when the other end of its leash pipe is closed."""
+    """Make the kernel kill a process group when the other end of a pipe is closed."""
     if not hasattr(fcntl, "F_SETSIG"):
         return
     with contextlib.suppress(OSError):  # if a sandbox forbids this, the program still exits when its input is closed
@@ -200,17 +205,23 @@ class ErrorOutput:
         self._first: str | None = None
 
     def feed(self, data: bytes) -> None:
-        """Look for an error message in bytes that the program wrote to standard error."""
+        """Look for an error message in the program's error output."""
         for line in self._lines.feed(data):
             self._examine_line(line)
 
     def find_error(self) -> str | None:
-        """Return the first line that looks like an error, or else the first line, or None if there are no lines."""
+        """Return the first line that looks like an error, or else the first line.
+
+        Return None if there are no lines.
+        """
         self._examine_line(self._lines.take_rest())
         return self._error or self._first
 
     def _examine_line(self, raw: bytes) -> None:
-        """Store a line if it is the first one, or the first that looks like an error. Ignore noise."""
+        """Store a line if it is the first one or the first error.
+
+        Ignore noise.
+        """
         line = raw.decode("utf-8", "replace").strip()
         if not line or re.search(_NOISE, line, re.IGNORECASE):
             return
@@ -221,7 +232,7 @@ class ErrorOutput:
 
 
 class ProgramPlayer(Player):
-    """Plays a sentence by writing its samples to the standard input of an external program."""
+    """Plays a sentence through the standard input of a program."""
 
     real_time = True
 
@@ -244,16 +255,19 @@ class ProgramPlayer(Player):
         except OSError as error:
             message = f"{self.name} could not be started: {error.strerror or error}"
             raise CannotSpeak(Reason.NO_PLAYER, message) from error
-        #: the number of sample bytes written so far, which is negative until the preamble is written
+        #: the number of sample bytes written; negative until the preamble is written
         self._written = -len(command.preamble)
         self._consumed = 0
-        #: the time by which the program must have exited after it has closed its input
+        #: the deadline for the program to exit after it has closed its input
         self._exit_due = NEVER
         self._closed = False
         self._write(memoryview(command.preamble))
 
     def offer(self, data: memoryview) -> int:
-        """Write the samples to the program once it has read the previous ones. Return the number of bytes written."""
+        """Write the samples if the program has read all earlier ones.
+
+        Return the number of bytes written.
+        """
         self.ended()  # raises CannotSpeak if the program has exited
         stdin = self._process.stdin
         if stdin.closed:
@@ -263,7 +277,7 @@ class ProgramPlayer(Player):
         return self._write(data) if _unread_bytes(stdin) == 0 or not is_held(stdin.fileno()) else 0
 
     def consumed(self) -> int:
-        """Return the number of sample bytes that the program has read from the pipe, and update `proven`."""
+        """Return the number of sample bytes that the program has read from the pipe."""
         if not self._process.stdin.closed:
             self._consumed = max(self._consumed, self._written - _unread_bytes(self._process.stdin))
         elif self._closed:
@@ -278,7 +292,10 @@ class ProgramPlayer(Player):
         self._process.stdin.close()
 
     def ended(self) -> bool:
-        """Return whether the program has played everything and exited. If it has failed, raise CannotSpeak."""
+        """Return whether the program has played everything and exited.
+
+        If it has failed, raise CannotSpeak.
+        """
         status = self._process.poll()
         self._read_stderr()
         if status is None:
@@ -291,17 +308,17 @@ class ProgramPlayer(Player):
         raise self._exit_error(status)
 
     def interests(self) -> list[Interest]:
-        """Return the descriptors of the program's input, error output and exit, each with its poll events."""
+        """Return the program's descriptors, each with its poll events."""
         process = self._process
         wanted = ((process.stdin, select.POLLOUT), (process.stderr, select.POLLIN), (process.exit, select.POLLIN))
         return [(file.fileno(), events) for file, events in wanted if file is not None and not file.closed]
 
     def wake_at(self) -> float:
-        """Return the time at which to check whether the program has exited, or NEVER if poll is enough."""
+        """Return when to check whether the program has exited, or NEVER if poll is enough."""
         return time.monotonic() + EXIT_CHECK_S if self._process.exit is None else self._exit_due
 
     def kill(self) -> None:
-        """Kill the program, close its standard input, and wait briefly for its exit."""
+        """Kill the program, and wait briefly for its exit."""
         self._process.kill()
         self._process.stdin.close()
         self._process.await_end(REAP_WAIT_S)
@@ -329,7 +346,7 @@ class ProgramPlayer(Player):
         return written
 
     def _exit_error(self, status: int) -> CannotSpeak:
-        """Return the error for a program that exited too early or with an error status."""
+        """Return the error for a program that exited too early or failed."""
         self.consumed()
         line = self._errors.find_error()
         if status < 0:
@@ -340,7 +357,7 @@ class ProgramPlayer(Player):
         return CannotSpeak(reason, line or f"{self.name} exited with status {status}")
 
     def _read_stderr(self) -> None:
-        """Read new error output of the program without blocking, and close the pipe at its end."""
+        """Read the program's new error output without blocking."""
         stderr = self._process.stderr
         data = None if stderr.closed else stderr.read(65536)  # None if there is nothing to read
         if data:

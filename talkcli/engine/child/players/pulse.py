@@ -1,4 +1,4 @@
-"""The player "pulse", which sends its samples directly to the sound server (PulseAudio or PipeWire).
+"""The player "pulse", which sends its samples directly to the sound server.
 
 Each sentence has a connection and a stream of its own. Opening both takes 1 ms, while starting a program takes 9 ms.
 The server reports more than a program could: when the stream started, whether it was moved, suspended or killed, how
@@ -49,8 +49,7 @@ class Level:
 
     volume: float  # volume of the loudest channel; 1.0 is 100 %, and higher values are possible
     muted: bool
-    #: whether the volumes of the sink's streams are absolute, so that the sink's own volume doesn't reduce them any
-    #: further
+    #: whether stream volumes are absolute, so that the sink's volume doesn't reduce them further
     flat: bool = False
 
 
@@ -78,8 +77,7 @@ class PulsePlayer(Player):
         self._wanted_device = device
         self._audible = audible
         self._written = self._heard = 0
-        #: the number of seconds heard according to the server's last report, and the time of that report; None until
-        #: sound is heard
+        #: the seconds heard and the time, from the server's last report; None until sound is heard
         self._clock_report: tuple[float, float] | None = None
         #: the number of bytes written when the server last ran out of samples, or None while it plays
         self._dry_at: int | None = None
@@ -140,12 +138,12 @@ class PulsePlayer(Player):
         return length
 
     def consumed(self) -> int:
-        """Return the number of bytes that have been heard according to the server's clock."""
+        """Return the number of bytes heard so far, by the server's clock."""
         self.heard()
         return self._heard
 
     def heard(self) -> float | None:
-        """Return how many seconds of the stream have been heard according to the server's clock."""
+        """Return the number of seconds heard so far, by the server's clock."""
         if self._drained:
             self._heard = self._written
         elif self._clock_report is not None:
@@ -160,16 +158,19 @@ class PulsePlayer(Player):
         self._run_and_check()
 
     def ended(self) -> bool:
-        """Return whether the server has played the whole stream. If the stream has failed, raise CannotSpeak."""
+        """Return whether the server has played the whole stream.
+
+        If the stream has failed, raise CannotSpeak.
+        """
         self._run_and_check()
         return self._drained
 
     def interests(self) -> list[Interest]:
-        """Return the descriptors that libpulse wants to wait for, each with its poll events."""
+        """Return libpulse's descriptors, each with its poll events."""
         return self._loop.interests
 
     def wake_at(self) -> float:
-        """Run libpulse, and return the time at which it has more work to do or a time limit ends.
+        """Run libpulse, and return when it needs to run again.
 
         The result is 0, which means now, if the server has room for samples. It is also 0 after each report of the
         playback time, because words may be due.
@@ -182,7 +183,7 @@ class PulsePlayer(Player):
         return min(self._loop.wake_at, self._ready_by, self._resumed_by, self._time_request_at, settled_at)
 
     def kill(self) -> None:
-        """Close the connection, so that the server drops the stream and its remaining samples."""
+        """Close the connection, which makes the server drop the stream."""
         if self._loop.freed:
             return
         self._lib.context_disconnect(self._context)
@@ -199,7 +200,7 @@ class PulsePlayer(Player):
 
     @property
     def output(self) -> Output | None:
-        """The sink, its volume and whether it was muted, or None until the server has reported them."""
+        """The sink, its volume and mute state; None until the server reports them."""
         sink, stream = self._sink_level, self._stream_level
         if self.device is None or sink is None or stream is None or self._is_volume_pending():
             return None
@@ -209,7 +210,7 @@ class PulsePlayer(Player):
     # -- the states of the stream
 
     def _run_and_check(self) -> None:
-        """Process the server's messages. If the stream has failed, raise CannotSpeak.
+        """Run libpulse, and raise CannotSpeak if the stream has failed.
 
         Raises:
             CannotSpeak: The stream has failed.
@@ -219,12 +220,15 @@ class PulsePlayer(Player):
             raise self._error
 
     def _run_libpulse(self) -> None:
-        """Run libpulse and take the next steps of the stream until there is no more work."""
+        """Run libpulse until there is no more work."""
         while self._loop.iterate() or self._advance_stream():
             pass
 
     def _advance_stream(self) -> bool:
-        """Check the stream's state and take the next step. Return whether libpulse may have more work now."""
+        """Check the stream's state and take the next step.
+
+        Return whether libpulse may have more work now.
+        """
         if self._error is not None or self._drained:
             return False
         state = self._lib.context_get_state(self._context)
@@ -249,7 +253,10 @@ class PulsePlayer(Player):
         return False
 
     def _open_stream(self) -> bool:
-        """Create the stream, and connect it to a sink. Return whether libpulse may have more work now."""
+        """Create the stream, and connect it to a sink.
+
+        Return whether libpulse may have more work now.
+        """
         buffered, request = (each * self._rate // 1000 * SAMPLE_BYTES for each in (BUFFER_MS, REQUEST_MS))
         # The server starts playing once the buffer is full. If it started with the first piece, it would run out of
         # samples before the second, and would have to rewind. Some sinks can't rewind.
@@ -269,7 +276,10 @@ class PulsePlayer(Player):
         return True
 
     def _follow_sink(self) -> bool:
-        """Respond to a change or suspension of the stream's sink. Return whether any requests were sent."""
+        """Respond to a change or suspension of the stream's sink.
+
+        Return whether any requests were sent.
+        """
         index = int(self._lib.stream_get_device_index(self._stream))
         changed = index != self._sink_index
         if changed:
@@ -297,7 +307,7 @@ class PulsePlayer(Player):
         return changed
 
     def _request_time(self) -> bool:
-        """Send a request for the playback time if one is due, and return whether it was sent."""
+        """Request the playback time if it is due, and return whether a request was sent."""
         if time.monotonic() < self._time_request_at:
             return False
         self._time_request_at = NEVER
@@ -305,19 +315,19 @@ class PulsePlayer(Player):
         return True
 
     def _request_levels(self, *_: Any) -> None:
-        """Request the volumes of the sink and the stream. libpulse calls this if any volume may have changed."""
+        """Request the volumes of the sink and the stream."""
         self._pending_levels += 1
         sink, stream = self._sink_index, self._lib.stream_get_index(self._stream)
         self._release(self._lib.context_get_sink_info_by_index(self._context, sink, self._sink_callback, None))
         self._release(self._lib.context_get_sink_input_info(self._context, stream, self._stream_callback, None))
 
     def _release(self, operation: int | None) -> None:
-        """Release the handle of an operation, if there is one. The operation keeps running."""
+        """Release the handle of an operation, which keeps running."""
         if operation is not None:
             self._lib.operation_unref(operation)
 
     def _room(self) -> int:
-        """Return how many bytes of whole samples the server has room for, or 0 if writing isn't possible now."""
+        """Return how many bytes the server has room for."""
         if self._sink_index == libpulse.NO_INDEX or self._closed or self._error is not None:
             return 0
         if self._audible and not (self._level_refused or self.output):
@@ -333,7 +343,7 @@ class PulsePlayer(Player):
         return self._pending_levels > 0 or time.monotonic() < self._volume_settled_at
 
     def _record_mute(self) -> None:
-        """If the output is muted now, mark the whole sentence as muted, and fail if it must be audible."""
+        """If the output is silent, mark the sentence as muted or failed."""
         levels = [each for each in (self._sink_level, self._stream_level) if each is not None]
         if self._drained or self._is_volume_pending() or not any(each.muted or each.volume == 0 for each in levels):
             return
@@ -346,7 +356,7 @@ class PulsePlayer(Player):
         self._clock_report, self._time_request_at = None, 0.0
 
     def _record_failure(self) -> None:
-        """Record that the stream has failed, with a message for libpulse's error number."""
+        """Record that the stream has failed, and why."""
         if self._error is not None:
             return
         reason = Reason.AUDIO_DEVICE if self._written == 0 else Reason.AUDIO_LOST
@@ -369,7 +379,7 @@ class PulsePlayer(Player):
     # -- callbacks of libpulse
 
     def _on_started(self, *_: Any) -> None:
-        """Restart the clock after the server has started to play, which proves that sound was heard."""
+        """Restart the clock, because the server has started to play."""
         self.proven, self._dry_at = True, None
         self._restart_clock()
 
@@ -378,7 +388,7 @@ class PulsePlayer(Player):
         self._dry_at = self._written
 
     def _on_time(self, *_: Any) -> None:
-        """Store the playback time that the server has reported, or request it again if nothing was heard."""
+        """Store the playback time reported by the server."""
         if not self.proven:
             return  # before the stream has started, the reported time is only the delay of the answer
         heard, now = c_uint64(), time.monotonic()
@@ -388,7 +398,7 @@ class PulsePlayer(Player):
             self._time_request_at = now + TIME_REQUEST_S
 
     def _on_drained(self, _stream: int, success: int, _data: object) -> None:
-        """Record that the server has played the whole stream, or that the stream has failed."""
+        """Record whether the server has played the whole stream."""
         if not success:
             self._record_failure()
             return
@@ -407,7 +417,7 @@ class PulsePlayer(Player):
             self._level_refused = True
 
     def _on_stream(self, _context: int, found: Any, end: int, _data: object) -> None:
-        """Store the volume and mute state of the stream, as reported by the server."""
+        """Store the volume and mute state that the server reports for the stream."""
         self._pending_levels -= end != 0
         if end == 0:
             self._stream_level = Level(libpulse.loudest(found[0].volume), bool(found[0].mute))

@@ -17,12 +17,18 @@ else:
 
 
 class NotInstalled(Exception):
-    """Raised if software that a synthesizer needs is not installed. The message says what to install."""
+    """Raised if software that a synthesizer needs is not installed.
+
+    The message says what to install.
+    """
 
 
 @frozen
 class SpeechSettings:
-    """The settings for speaking a sentence, except the voice. The defaults are those of pyttsx3."""
+    """The settings for speaking a sentence, except the voice.
+
+    The defaults are those of pyttsx3.
+    """
 
     rate: int = 200  # words per minute, 80 to 450
     volume: float = 1.0  # 0.0 to 1.0; 1.0 is the voice's natural volume
@@ -103,7 +109,7 @@ class Synthesizer(Protocol):
         """
 
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
-        """Synthesize a sentence, and return after writing all of it to the sink.
+        """Synthesize a sentence, and write it to the sink.
 
         The sample rate comes first, and every word is reported before its first sample is written. The times of words
         never decrease, but their positions in the text may jump back and repeat.

@@ -39,13 +39,18 @@ class CombinedSynthesizer:
         return (*self._espeak.voices(), *models.installed_voices())
 
     def load(self, voice: str) -> None:
-        """Choose a voice of libespeak-ng or a neural voice for the next sentences."""
+        """Choose the voice for the next sentences."""
         current: Synthesizer = self._get_piper() if is_neural(voice) else self._espeak
         current.load(voice)
         self._current, self.voice = current, current.voice
 
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
-        """Speak with the current voice. If it is a neural voice and can't be used, speak with libespeak-ng."""
+        """Speak a text with the current voice.
+
+        If a neural voice can't be used, speak with libespeak-ng.
+
+        The error is raised instead if `settings.voice_only` is set, or if samples have already been written.
+        """
         neural = self._neural
         if neural is None or self._current is not neural or settings.voice_only:
             self._current.speak(text, settings, sink)
@@ -71,7 +76,7 @@ class CombinedSynthesizer:
 
     @property
     def loader(self) -> ModelLoader | None:
-        """The object that loads neural voices, or None if no neural voice has been requested yet."""
+        """The model loader, or None if no neural voice has been requested yet."""
         return self._neural.loader if self._neural else None
 
     def carry_out(self, command: LoadVoice | DropVoice) -> None:
@@ -83,7 +88,7 @@ class CombinedSynthesizer:
             loader.start(command.voice)
 
     def _get_piper(self) -> Piper:
-        """Return the synthesizer for neural voices, which the first call creates."""
+        """Return the synthesizer for neural voices, and create it on first use."""
         if self._neural is None:
             from talkcli.engine.child.synthesizers.piper import Piper
 

@@ -88,7 +88,9 @@ def _events_of(pointer: Any) -> Iterator[_EspeakEvent]:
 
 
 def load_library() -> tuple[Any, str, int]:
-    """Load and initialize libespeak-ng. Return pyttsx3's binding, the version and the sample rate.
+    """Load and initialize libespeak-ng.
+
+    Return pyttsx3's binding, the version and the sample rate.
 
     The library of the system is preferred. If it is missing, the library from the package espeakng-loader is used. Call
     this once per process, before anything imports `pyttsx3.drivers._espeak`, which also loads the library.
@@ -120,7 +122,10 @@ def load_library() -> tuple[Any, str, int]:
 
 
 def _preload_library() -> tuple[str, bytes | None]:
-    """Load the library before pyttsx3's binding does. Return where it came from, and the directory of its data."""
+    """Load the library before pyttsx3's binding does.
+
+    Return where it came from, and the directory of its data.
+    """
     try:
         ctypes.CDLL(_LIBESPEAK)
         return "system", None
@@ -177,7 +182,11 @@ class Espeak:
         return (*_list_voices(self._espeak, None), *_list_mbrola_voices(self._espeak), *_list_variants(self._espeak))
 
     def load(self, voice: str) -> None:
-        """Load a voice by its id, which may end with a variant, or by another name known to the library."""
+        """Load a voice by its id or by another name known to the library.
+
+        Raises:
+            UnknownVoice: One of the voice's files is missing. The library keeps the previous voice.
+        """
         self._stop_phonemizer()
         # Forget the rate, so that it is set again. Otherwise some voices would make the next one up to a third slower.
         self._parameters.clear()
@@ -201,7 +210,10 @@ class Espeak:
         errors: list[BaseException] = []
 
         def on_audio(samples: Any, count: int, events: Any) -> int:
-            """Pass samples and events to the sink. Return 0 to continue the synthesis, or 1 to stop it."""
+            """Pass samples and events to the sink.
+
+            Return 0 to continue the synthesis, or 1 to stop it.
+            """
             if errors:
                 return 1
             try:
@@ -225,14 +237,14 @@ class Espeak:
             raise CannotSpeak(Reason.ENGINE_FAILED, f"espeak_Synth failed with {status}")
 
     def load_language(self, language: str) -> None:
-        """Load a voice for a language code such as "de-at" or, if there is none, for "de" or English."""
+        """Load the best voice for a language code such as "de-at"."""
         self._stop_phonemizer()
         found = (self._find_voice(each) for each in (language, language.partition("-")[0], *_ENGLISH))
         self.load(next((each.id for each in found if each), self.voice))
 
     @contextlib.contextmanager
     def phonemizer(self, language: str) -> Iterator[EspeakPhonemizer]:
-        """Switch the library to a language, and provide a phonemizer for it in a `with` block.
+        """Provide a phonemizer for a language in a `with` block.
 
         Another thread may use the phonemizer during the block, but nothing may use the synthesizer. After the block,
         calls of the phonemizer raise Stopped. If a call is still running at the end of the block, it continues for a
@@ -260,10 +272,10 @@ class Espeak:
         return find_voice(word, self._listed)
 
     def _stop_phonemizer(self) -> None:
-        """Wait for the last phonemizer to finish, and switch back to the synthesizer's voice."""
+        """Wait for the last phonemizer to finish, and restore the synthesizer's voice."""
         phonemizer, self._phonemizer = self._phonemizer, None
         if phonemizer is not None:
-            with phonemizer.busy:  # Its last call may still be running.
+            with phonemizer.busy:  # The phonemizer's last call may still be running.
                 self._espeak.SetVoiceByName(self.voice.encode())
             self._parameters.clear()
 
@@ -279,7 +291,7 @@ class Espeak:
 
 
 class EspeakPhonemizer:
-    """Converts text to phonemes with libespeak-ng, as `phonemes.Phonemizer` describes.
+    """Converts text to phonemes with libespeak-ng.
 
     Args:
         espeak: pyttsx3's binding of the library.
@@ -327,7 +339,7 @@ class EspeakPhonemizer:
         return positions
 
     def ends_with_abbreviation(self, clause: str) -> bool:
-        """Return whether a clause ends with an abbreviation such as "Mr.", after which the library makes no pause."""
+        """Return whether a clause ends with an abbreviation such as "Mr."."""
         word = clause.rsplit(maxsplit=1)[-1]
         _, alone = self._speak_silently(word)
         _, with_pause = self._speak_silently(f"{word} A")
@@ -339,7 +351,7 @@ class EspeakPhonemizer:
 
     @contextlib.contextmanager
     def _library_call(self) -> Iterator[None]:
-        """Hold the lock in a `with` block that calls the library. After `end`, raise Stopped.
+        """Hold the library's lock during a `with` block. Raise Stopped if `end` was called.
 
         Raises:
             Stopped: `end` was called before or during the block. The result of the call may be incomplete.
@@ -352,7 +364,10 @@ class EspeakPhonemizer:
             raise Stopped
 
     def _speak_silently(self, text: str) -> tuple[list[tuple[int, int]], int]:
-        """Speak a text without output. Return the positions of its words, and the samples in its first clause."""
+        """Speak a text without output.
+
+        Return the positions of its words, and the samples in its first clause.
+        """
         text = guard.guarded(text, self._voice)
         positions: list[tuple[int, int]] = []
         clause_ends: list[int] = []
@@ -363,7 +378,7 @@ class EspeakPhonemizer:
                     positions.append(position)
                 elif event.type == self._espeak.EVENT_END:
                     clause_ends.append(event.sample)
-            return int(self._ended)  # 1 stops the synthesis
+            return int(self._ended)  # returning 1 stops the synthesis
 
         with self._library_call():
             self._espeak.SetSynthCallback(on_audio)
@@ -385,7 +400,7 @@ def _list_variants(espeak: Any) -> list[Voice]:
 
 
 def _list_mbrola_voices(espeak: Any) -> list[Voice]:
-    """Return the installed MBROLA voices. The library also lists those that aren't installed."""
+    """Return the library's MBROLA voices that are installed."""
     if not on_path("mbrola"):
         return []
     return [each for each in _list_voices(espeak, _MBROLA) if _has_mbrola_data(each.id)]

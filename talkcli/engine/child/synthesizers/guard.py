@@ -52,8 +52,8 @@ _SYMBOL_LETTERS = frozenset(map(chr, (*range(0x2460, 0x2500), *range(0x2800, 0x2
 _CLAUSE_END = re.compile(r"[.,;:!?…](?:[\s()\[\]{}<>\"«»“”‘’„]|\Z)|[。、，！？：；︒؟،؛।॥։՝]|\n\s*\n")
 #: Matches a hyphen between a symbol and a letter.
 _HYPHEN = re.compile(r"(?<=[^\w\s]|_)-(?=[^\W\d_])")
-#: From the first of these characters on, the library treats each character as a word. The other two are the first and
-#: the last Hangul syllable. The library splits each syllable into letters of three bytes.
+#: The library treats the first of these characters and all later ones as words of their own. The other two are the
+#: first and the last Hangul syllable. The library splits each syllable into letters of three bytes.
 _IDEOGRAPHS, _HANGUL, _HANGUL_END = "\u2e80", "\uac00", "\ud7a3"
 #: Characters that crash all voices except those of the given languages. If a voice doesn't know a character, the
 #: library loads the default language of its script. If that language has no name for the character, the library loads
@@ -86,7 +86,9 @@ _SEPARATE_DIGITS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def guarded(text: str, voice: str = "") -> str:
-    """Replace the characters of a text that would crash libespeak-ng, and return the text. Its length stays the same.
+    """Replace the characters in a text that would crash libespeak-ng.
+
+    Its length stays the same.
 
     Args:
         text: The text to make safe.
@@ -102,13 +104,13 @@ def guarded(text: str, voice: str = "") -> str:
 
 
 def _unsafe_characters(language: str) -> re.Pattern[str]:
-    """Return a pattern that matches the characters that crash the voices of a language."""
+    """Return a pattern for the characters that crash the voices of a language."""
     found = (signs for languages, signs in _CRASHING_CHARACTERS.items() if language not in languages)
     return re.compile(f"[{''.join(found)}]")
 
 
 def _split_number(number: str, least: int, most: int) -> str:
-    """If a number has `least` to `most` digits, split it in two by replacing one digit with a superscript."""
+    """Split a number in two if it has `least` to `most` digits."""
     if not least <= sum(map(str.isdigit, number)) <= most:
         return number
     middle = next(place for place in range(len(number) // 2, len(number)) if number[place].isdigit())
@@ -116,7 +118,7 @@ def _split_number(number: str, least: int, most: int) -> str:
 
 
 def _without_long_initials(text: str) -> str:
-    """Replace dots with blanks in long sequences of initials, which would overrun the library's buffers."""
+    """Replace the dots in long sequences of initials with blanks."""
     result = list(text)
     looked_up = spelled = words = size = 0
     dots: list[int] = []
@@ -154,24 +156,30 @@ def _ends_clause(text: str, start: int, end: int) -> bool:
 
 
 def _is_letter(character: str) -> bool:
-    """Return whether the library counts a character of a word as a letter. Quotes and joiners don't count."""
+    """Return whether the library counts a character of a word as a letter.
+
+    Quotes and joiners don't count.
+    """
     return character.isalnum() or character in _SYMBOL_LETTERS or unicodedata.category(character).startswith("M")
 
 
 def _utf8_bytes(text: str) -> int:
-    """Return the length of a text in UTF-8. A lone surrogate counts as one byte, because it is replaced."""
+    """Return the length of a text in UTF-8.
+
+    A lone surrogate counts as one byte, because it is replaced.
+    """
     return len(text.encode("utf-8", "replace"))
 
 
 def _max_bytes(character: str) -> int:
-    """Return the maximum number of bytes that the library may need for a character or its replacement."""
+    """Return the most bytes that the library may need for a character."""
     if _HANGUL <= character <= _HANGUL_END:
         return 9
     return max(2, _utf8_bytes(character), _utf8_bytes(character.lower()))
 
 
 def _without_leading_hyphens(text: str) -> str:
-    """Replace a hyphen with a blank if only symbols come before it in its clause, as in "'-o".
+    """Replace hyphens that follow only symbols in their clause with blanks.
 
     The library doesn't mark the beginning of the word after such a hyphen. Later, it looks for the mark and reads
     beyond the start of its list of phonemes. This crashes Vietnamese, Danish, Hindi and other voices.
@@ -187,7 +195,7 @@ def _without_leading_hyphens(text: str) -> str:
 
 
 def _split_word(match: re.Match[str]) -> str:
-    """Return the matched text. If it is a word that is too long for the library, split it first.
+    """Split the matched word if it is too long for the library.
 
     Apostrophes become blanks, or pairs of letters get another case.
     """

@@ -51,7 +51,7 @@ _MAX_ERROR_CHARS = 200
 #: The version of `vits.split_model`. Increase it whenever that function returns different halves, so that old cached
 #: halves are no longer used.
 _SPLIT_VERSION = 1
-#: The names of the inputs that every model has, and of the extra input of a model with several speakers.
+#: The names of the inputs of every model, and of the extra input for the speaker.
 _INPUTS, _SPEAKER_INPUT = ("input", "input_lengths", "scales"), "sid"
 
 #: The maximum size of the cache, which has room for about eight voices. If the cache gets larger, the oldest files are
@@ -90,7 +90,7 @@ class ModelCache:
         """Return the paths of the encoder and the decoder, and mark them as used.
 
         Raises:
-            OSError: They aren't cached.
+            OSError: One of them isn't cached.
         """
         paths = self._cached_path(key, _ENCODER_SUFFIX), self._cached_path(key, _DECODER_SUFFIX)
         for each in paths:
@@ -98,12 +98,12 @@ class ModelCache:
         return paths
 
     def store(self, key: str, make_encoder: Callable[[str | None], Any], decoder: Iterable[Buffer]) -> Any:
-        """Create and return the encoder, store both halves of the model if possible, and remove old files.
+        """Create the encoder of a model, and cache both halves if possible.
 
         Args:
             key: The key of the model.
-            make_encoder: A function that creates the encoder and writes it to a path. It is called with None if the
-                halves can't be stored.
+            make_encoder: A function that creates the encoder and writes it to a path. If anything fails, it is called
+                again with None, and then writes nothing.
             decoder: The content of the decoder's file, in parts.
 
         Returns:
@@ -128,7 +128,7 @@ class ModelCache:
         return os.path.join(self._directory, key + suffix)
 
     def _shrink(self) -> None:
-        """Remove the oldest files if the cache is too large, and temporary directories of processes that have died."""
+        """Remove old files if the cache is too large, and leftover temporary directories."""
         size = 0
         with contextlib.suppress(OSError):  # Another process may be removing the same files.
             cached = [each for each in os.scandir(self._directory) if _CACHED_NAME.fullmatch(each.name)]
@@ -165,7 +165,10 @@ class ModelRun:
         self.options.log_severity_level = 4  # Log only fatal errors. Other errors raise exceptions.
 
     def end(self) -> None:
-        """Make the current run and all later ones raise an exception. Any thread may call this."""
+        """Make the current run and all later ones raise an exception.
+
+        Any thread may call this.
+        """
         self.options.terminate = True
 
 
@@ -231,7 +234,7 @@ class Model:
         return Frames(tuple(values), tuple(int(each) for each in np.cumsum(durations)))
 
     def decode(self, frames: Frames, begin: int, end: int, run: ModelRun) -> Any:
-        """Decode the frames from `begin` up to but not including `end`. The samples are floats from -1.0 to 1.0.
+        """Decode a range of frames, and return their samples as floats.
 
         Raises:
             VoiceFileError: The model is faulty, or the run was ended.
@@ -250,7 +253,7 @@ class Model:
             raise self._not_piper_error(f"it makes {len(samples)} samples for {high - low} frames")
         part = samples[(begin - low) * hop : (end - low) * hop]
         if not np.isfinite(part).all():
-            raise VoiceFileError(f"{self.path} makes samples that are not numbers; download the voice again")
+            raise VoiceFileError(f"{self.path} produces invalid samples; download the voice again")
         return part
 
     def seconds(self, frames: int) -> float:
@@ -258,7 +261,7 @@ class Model:
         return frames * self._samples_per_frame / self.description.rate
 
     def _set_halves(self, encoder: Any, decoder: Any) -> None:
-        """Store both halves of the model, check them, and test them with a phoneme.
+        """Store both halves of the model, and test them.
 
         Raises:
             VoiceFileError: The halves are faulty, or don't match the description.
@@ -284,7 +287,7 @@ class Model:
         return found
 
     def _test_model(self) -> int:
-        """Synthesize the phoneme with the highest id as a test, and return the number of samples per frame."""
+        """Test the model with one phoneme, and return the number of samples per frame."""
         ids = self.description.phoneme_ids
         highest = max(each for every in ids.values() for each in every)
         phonemes = [*ids[BEGIN_SYMBOL], *ids[PAD_SYMBOL], highest, *ids[PAD_SYMBOL], *ids[END_SYMBOL]]
@@ -310,7 +313,9 @@ class Model:
 
 
 def load_libraries(path: str) -> None:
-    """Import numpy and onnxruntime. Error messages name the `path` of the model that needs them.
+    """Import numpy and onnxruntime.
+
+    Error messages name the `path` of the model that needs them.
 
     This takes 0.25 s, and blocks all other threads for a tenth of that time.
 
@@ -325,7 +330,7 @@ def load_libraries(path: str) -> None:
 
 
 def _split_and_cache(path: str, content: bytes, cache: ModelCache | None, key: str) -> tuple[Any, Any]:
-    """Split a model, cache its halves, and return an onnxruntime session for each half.
+    """Split and cache a model, and return a session for each half.
 
     Raises:
         VoiceFileError: The model can't be split or loaded.
@@ -380,7 +385,10 @@ def _create_session(model: str | bytes, optimized_path: str | None = None) -> An
 
 
 def _model_error(path: str, problem: str, error: Exception, step: str = "download the voice again") -> VoiceFileError:
-    """Convert an exception of onnxruntime to a VoiceFileError. `step` tells the user what to do next."""
+    """Convert an exception of onnxruntime to a VoiceFileError.
+
+    `step` tells the user what to do next.
+    """
     if _is_out_of_memory(error):
         return no_memory_error(path)
     first_line = (str(error).strip() or type(error).__name__).splitlines()[0]

@@ -96,7 +96,10 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
         return item
 
     def close(self) -> None:
-        """Tell the thread to discard its current item and end. Return without waiting for it. Call this only once."""
+        """Tell the thread to end, without waiting for it.
+
+        Call this only once.
+        """
         with self._lock:
             self._closed = True
             os.close(self.descriptor)
@@ -104,7 +107,7 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
         self._room.release()
 
     def _put(self, item: _T | None, error: BaseException | None = None) -> None:
-        """Add an item, or the end of the iterator with its error, and make the descriptor readable."""
+        """Add an item or the end mark, and make the descriptor readable."""
         self._made.append((item, error))
         with self._lock:
             if not self._closed:
@@ -115,14 +118,14 @@ class ModelLoader:
     """Loads neural voices one after another, and stores their models."""
 
     def __init__(self) -> None:
-        #: the loaded models by voice, with the fingerprints that their files had before they were loaded
+        #: the loaded models by voice, with the fingerprints of their files before loading
         self._models: dict[str, tuple[Model, _Fingerprints]] = {}
         self._waiting: deque[str] = deque()
         self._load: BackgroundIterator[tuple[Model, _Fingerprints]] | None = None
         #: the voice that is being loaded, and when its load started (monotonic time)
         self._voice = ""
         self._started_at = 0.0
-        #: error messages by voice, for voices that couldn't be loaded, or have failed to speak a sentence
+        #: error messages by voice, for voices that failed to load or to speak
         self.errors: dict[str, str] = {}
         self._events: list[VoiceLoaded | VoiceUnloaded | VoiceMemory] = []
         #: the private memory of the process before the first load, and how much it had grown at the last report
@@ -133,7 +136,7 @@ class ModelLoader:
 
     @property
     def descriptor(self) -> int | None:
-        """A file descriptor that becomes readable when the load has finished, or None if no voice is being loaded."""
+        """A descriptor that becomes readable when the load has finished."""
         return self._load.descriptor if self._load else None
 
     @property
@@ -142,13 +145,21 @@ class ModelLoader:
         return self._started_at + LOAD_LIMIT_S
 
     def drop(self, voice: str) -> None:
-        """Unload a voice, and forget its error. If it is being spoken, its memory is freed after the sentence."""
+        """Unload a voice, and forget its error.
+
+        If the voice is speaking, its memory is freed after the sentence.
+        """
         if self._models.pop(voice, None):
             self._unmeasured = ""
         self.errors.pop(voice, None)
 
     def start(self, voice: str) -> None:
-        """Load a voice in the background, unless it is already loaded or queued."""
+        """Load a voice in the background.
+
+        If it is already loaded, add a `VoiceLoaded` event at once.
+
+        When the load begins, any earlier error of the voice is forgotten.
+        """
         if voice in self._models:
             self._events.append(VoiceLoaded(voice, 0.0))
         elif voice not in self._waiting and not (self._load and voice == self._voice):
@@ -157,9 +168,11 @@ class ModelLoader:
             self._start_next_load()
 
     def get_model(self, voice: str) -> Model | None:
-        """Return the model of a voice, or None if it isn't loaded. Finish a load first if its thread is done.
+        """Return the model of a voice, or None if it isn't loaded.
 
-        If the voice has failed to speak, and its files have changed since it was loaded, it is unloaded.
+        Unload a failed voice whose files have changed.
+
+        If the thread of a load is done, finish the load first.
         """
         self._finish_load()
         model, fingerprints = self._models.get(voice, (None, ()))
@@ -170,14 +183,17 @@ class ModelLoader:
         return model
 
     def mark_spoken(self, voice: str) -> None:
-        """Schedule a memory measurement, because the first sentences of a voice allocate memory permanently."""
+        """Schedule a memory measurement.
+
+        The first sentences with a voice need memory that is never freed.
+        """
         if voice not in self._models:
             self._unmeasured = ""  # The voice was unloaded during the sentence, and its memory has been freed just now.
         elif self._unmeasured is None:
             self._unmeasured = voice
 
     def take_events(self) -> list[VoiceLoaded | VoiceUnloaded | VoiceMemory]:
-        """Return and clear the events since the last call, including that of a load that has just finished."""
+        """Return and clear the events since the last call."""
         self._finish_load()
         if self._unmeasured is not None:
             self._measure_memory(self._unmeasured, min_growth=GROWTH_BYTES)
@@ -185,7 +201,7 @@ class ModelLoader:
         return events
 
     def _finish_load(self) -> None:
-        """If the load has finished or takes too long, store its result and start the next load."""
+        """Finish the current load if it is complete or takes too long."""
         load, voice = self._load, self._voice
         if load is None:
             return
@@ -211,7 +227,7 @@ class ModelLoader:
         self._start_next_load()
 
     def _measure_memory(self, voice: str, min_growth: float = -math.inf) -> None:
-        """Record an event with the growth of the process's memory since before the first load.
+        """Record an event about the growth of the process's memory.
 
         If the growth since the last event is below `min_growth` bytes, record nothing unless a voice was unloaded.
         """
@@ -236,7 +252,7 @@ class ModelLoader:
 
 
 def _fingerprints(path: str) -> _Fingerprints:
-    """Return values that change whenever the files of a voice change, or () if a file can't be found."""
+    """Return the fingerprints of a voice's files, or () if a file is missing."""
     try:
         found = [os.stat(each) for each in (path, path + models.JSON_SUFFIX)]
     except OSError:
@@ -273,7 +289,10 @@ def _open_cache() -> ModelCache | None:
 
 
 def _read_private_bytes() -> int | None:
-    """Return how much private memory this process uses, including swap. Return None if a sandbox hides it."""
+    """Return how much private memory this process uses, including swap.
+
+    Return None if a sandbox hides it.
+    """
     try:
         with open("/proc/self/status", "rb") as file:
             fields = dict(line.split(b":", 1) for line in file)

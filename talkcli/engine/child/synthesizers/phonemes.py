@@ -1,4 +1,4 @@
-"""Functions that split a text into sentences for a neural voice, and convert them to phonemes.
+"""Functions that split a text into sentences and convert them to phonemes.
 
 libespeak-ng returns the phonemes of each clause with blanks between words. When it speaks the clause, it reports the
 positions of the words in the text. These two lists have to be aligned, because the phonemes of some words are joined
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 else:
     Protocol = object
 
-#: The maximum number of phonemes that a model speaks at once. The time and memory that it needs grow with the square of
+#: The maximum number of phonemes in one run of a model. The time and memory that it needs grow with the square of
 #: this number. On a PC, 250 phonemes take 0.25 s and 60 MB, and 800 phonemes take 2 s and 450 MB.
 MAX_PART_PHONEMES = 250
 #: The maximum number of phonemes in a part, not counting the punctuation mark at its end.
@@ -67,7 +67,7 @@ class Phonemizer(Protocol):
 
 @frozen
 class SpeechPart:
-    """The phonemes of a sentence or of a part of a long sentence, which a model speaks at once."""
+    """The phonemes of a sentence, or of a part of a long one."""
 
     #: IPA characters, blanks and punctuation marks; never empty
     phonemes: tuple[str, ...]
@@ -78,7 +78,7 @@ class SpeechPart:
 
 
 def split_text(phonemizer: Phonemizer, text: str, *, ends_text: bool = True) -> Iterator[SpeechPart]:
-    """Split a text into parts that a model can speak at once.
+    """Split a text into parts that are short enough for one run of a model.
 
     A text without any speech has no parts. The phonemizer is used only while a part is being requested.
 
@@ -125,7 +125,7 @@ def split_text(phonemizer: Phonemizer, text: str, *, ends_text: bool = True) -> 
 
 
 def _split_long_groups(groups: Sequence[str]) -> Iterator[str]:
-    """Yield the groups of phonemes, but split those that are too long for a part."""
+    """Split groups of phonemes that are too long for a part."""
     for group in groups:
         for begin in range(0, len(group), _MAX_SECTION_PHONEMES):
             yield group[begin : begin + _MAX_SECTION_PHONEMES]
@@ -137,7 +137,7 @@ def _phoneme_groups(ipa: str) -> list[str]:
 
 
 def _locate_words(phonemizer: Phonemizer, clause: str, groups: Sequence[str]) -> list[tuple[int, int, int]]:
-    """Return the index of the first phoneme of each word in a clause, with the word's start and length.
+    """Find the first phoneme of each word in a clause.
 
     The phonemes are counted across all groups.
     """
@@ -161,7 +161,7 @@ def _locate_words(phonemizer: Phonemizer, clause: str, groups: Sequence[str]) ->
 
 
 def _drop_repeated_positions(positions: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the word positions without those that repeat an earlier one or go back in the text."""
+    """Drop word positions that repeat an earlier one or go back in the text."""
     found: list[tuple[int, int]] = []
     for position in positions:
         if not found or position[0] > found[-1][0]:
@@ -170,7 +170,7 @@ def _drop_repeated_positions(positions: Sequence[tuple[int, int]]) -> list[tuple
 
 
 def _map_indexes(first: str, second: str, places: Sequence[int]) -> list[int]:
-    """Return the indexes in the second string that correspond to `places` in the first string, which is similar."""
+    """Convert indexes in one string to the corresponding indexes in a similar string."""
     if len(first) * len(second) > _MAX_COMPARISONS:
         return [place * len(second) // len(first) for place in places]
     import difflib

@@ -59,17 +59,16 @@ _SPEECH_LEVEL = 0.001
 _WRITE_S = 0.1
 _FULL_SCALE = 32767
 _DEFAULT_PITCH = 50
-#: The rate of libespeak-ng at which it is as fast as Piper's voices at their natural pace, and the share of the
-#: speaking time that doesn't depend on the rate, because durations are rounded up to whole frames. Both values were
-#: fitted to five sentences, spoken by libespeak-ng 1.51 (gmw/en-US) at 80 to 450 words per minute, and by
-#: en_US-joe-medium at scales of 0.2 to 2.2. From 120 to 400 words per minute, the durations agree within 5 %. At 80 and
-#: 450, the model is 11 and 13 % slower.
+#: The rate at which libespeak-ng is as fast as Piper's voices at their natural pace, and the share of the speaking time
+#: that doesn't depend on the rate. Both values were fitted to five sentences, spoken by libespeak-ng 1.51 (gmw/en-US)
+#: at 80 to 450 words per minute, and by en_US-joe-medium at scales of 0.2 to 2.2. From 120 to 400 words per minute, the
+#: durations agree within 5 %. At 80 and 450, the model is 11 and 13 % slower.
 _NATURAL_WPM, _CONSTANT_SHARE = 195, 0.30
 _MIN_SCALE = 0.1
 
 
 class Piper:
-    """A synthesizer for Piper's neural voices. It uses libespeak-ng only while it speaks."""
+    """A synthesizer for Piper's neural voices."""
 
     version: str | None = None
 
@@ -77,14 +76,14 @@ class Piper:
         self._espeak = espeak
         self.loader = ModelLoader()
         self.voice = ""
-        #: whether any sound of the last sentence was written to its sink
+        #: whether the last sentence has produced any sound
         self.has_written = False
         #: the id of the current voice without the speaker, the speaker, and the path of the model
         self._model_id, self._speaker, self._path = "", "", ""
 
     @property
     def problem(self) -> str | None:
-        """A message saying why the current voice can't speak, or None if it is loaded."""
+        """The reason why the current voice can't speak, or None if it is loaded."""
         if self.loader.get_model(self._model_id) is not None:
             return None
         return self.loader.errors.get(self._model_id) or f"{self.voice} is not loaded"
@@ -108,6 +107,9 @@ class Piper:
         """Choose a voice by its id, which may end with "#" and a speaker.
 
         If a file of the voice is faulty, `speak` reports the error later.
+
+        Raises:
+            UnknownVoice: A package, the voice or the speaker is missing.
         """
         if missing := models.missing_package():
             raise UnknownVoice(missing)
@@ -152,7 +154,13 @@ class Piper:
             raise CannotSpeak(Reason.VOICE_FAILED, words) from error
 
     def _wait_for_model(self, voice: str, sink: SampleSink) -> Model:
-        """Return the model of a voice, after loading it if necessary. The sink keeps playing meanwhile."""
+        """Return the model of a voice, after loading it if necessary.
+
+        The sink keeps playing meanwhile.
+
+        Raises:
+            CannotSpeak: The voice can't be loaded.
+        """
         loader = self.loader
         if loader.get_model(voice) is None:
             loader.start(voice)  # Try again even after an error, because the files may have been repaired.
@@ -164,7 +172,7 @@ class Piper:
         return model
 
     def _write_sound(self, parts: Iterator[SpokenPart], rate: int, run: ModelRun, sink: SampleSink) -> None:
-        """Synthesize parts of a text in a background thread, and write their sound and words to the sink."""
+        """Write the sound of a text to the sink, while a background thread synthesizes the following parts."""
         write_bytes = int(_WRITE_S * rate) * SAMPLE_BYTES
         seconds = 0.0
         spoken_parts = BackgroundIterator(parts, _MAX_PARTS_AHEAD)
@@ -186,7 +194,7 @@ class Piper:
 def _speak_parts(
     model: Model, parts: Iterator[SpeechPart], speaker: int, settings: SpeechSettings, run: ModelRun
 ) -> Iterator[SpokenPart]:
-    """Synthesize the parts of a text, and yield the sound in small pieces, each with its words.
+    """Synthesize the parts of a text, and yield the sound in small pieces.
 
     Raises:
         VoiceFileError: The model is faulty, or doesn't know any of the phonemes.
@@ -224,7 +232,7 @@ def _speak_parts(
                 silent.clear()
             words, begin, count = (), end, min(_MAX_DECODED_FRAMES, 2 * count)
         if loudest < _SPEECH_LEVEL:
-            raise VoiceFileError(f"{model.path} made no sound from a text; download the voice again")
+            raise VoiceFileError(f"{model.path} produced no sound for a text; download the voice again")
         if part.ends_sentence and quiet < pause:
             yield bytes((pause - quiet) * SAMPLE_BYTES), ()
     if unknown and first:
@@ -255,7 +263,7 @@ def _word_time(model: Model, part: SpeechPart, places: Sequence[int], begins: Se
 
 
 def _cut_leading_silence(samples: Any, levels: Any, words: WordTimes, rate: int) -> tuple[Any, WordTimes]:
-    """Return the samples without the silence at the start of a sentence, and its words with adjusted times."""
+    """Cut the silence at the start of a sentence, and adjust the times of its words."""
     audible = (levels > _LEADING_LEVEL).nonzero()[0]
     cut = max(0, int(audible[0]) - int(_LEADING_S * rate)) if len(audible) else 0
     return samples[cut:], tuple((start, length, max(0.0, time - cut / rate)) for start, length, time in words)
@@ -267,7 +275,9 @@ def _to_bytes(samples: Any, volume: float) -> bytes:
 
 
 def _phoneme_ids(phonemes: Sequence[str], ids: Mapping[str, tuple[int, ...]]) -> tuple[list[int], list[int]]:
-    """Convert phonemes to the model's ids. Also return the index of each phoneme's first id.
+    """Convert phonemes to the model's ids.
+
+    Also return the index of each phoneme's first id.
 
     If the model doesn't know a phoneme, it gets the index of the next known phoneme, or of the end. If the model knows
     none of them, the list of indexes is empty.
@@ -283,7 +293,7 @@ def _phoneme_ids(phonemes: Sequence[str], ids: Mapping[str, tuple[int, ...]]) ->
 
 
 def _duration_scale(rate: int) -> float:
-    """Convert a rate in words per minute to a factor for the durations of all phonemes.
+    """Convert a rate in words per minute to a factor for all durations.
 
     The factor makes a sentence take as long as with libespeak-ng. Above 400 words per minute, the model is slower,
     because no phoneme can be shorter than a frame.

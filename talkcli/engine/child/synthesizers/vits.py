@@ -1,4 +1,4 @@
-"""Functions to split the model of a Piper voice (VITS, in ONNX format) into an encoder and a decoder.
+"""Functions to split the model of a Piper voice into an encoder and a decoder.
 
 The encoder turns phoneme ids into frames, and the decoder turns frames into samples. Each sample depends only on nearby
 frames, so the decoder can process a few frames at a time. The encoder also outputs how many frames each phoneme id
@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     Buffer = bytes | memoryview
     #: a field of a message: its number, its wire type (one of the four below), and its value. Integers stay encoded.
     Field = tuple[int, int, Buffer]
-    #: half of a model, which is a complete ONNX file in parts. The weights, which make up nearly all of it, are not
-    #: copied.
+    #: half of a model, as the parts of a complete ONNX file. The weights are not copied.
     ModelHalf = tuple[Buffer, ...]
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
@@ -55,7 +54,10 @@ _MAX_NAME_BYTES = 1000
 
 
 class NotSplit(Exception):
-    """Raised if a model is unsafe or isn't one of Piper's. The message gives the reason without the file's name."""
+    """Raised if a model is unsafe or isn't one of Piper's.
+
+    The message gives the reason without the file's name.
+    """
 
 
 def split_model(model: Buffer) -> tuple[ModelHalf, ModelHalf]:
@@ -97,13 +99,13 @@ def split_model(model: Buffer) -> tuple[ModelHalf, ModelHalf]:
 
 
 class _Reader:
-    """Reads the protobuf messages of one model. It limits the total number of fields."""
+    """Reads the protobuf messages of one model."""
 
     def __init__(self) -> None:
         self._fields_left = _MAX_FIELDS
 
     def fields(self, raw: Buffer) -> list[Field]:
-        """Parse a protobuf message, and return its fields."""
+        """Parse a protobuf message, and return its fields. Raise NotSplit if it is invalid."""
         found = []
         at, end = 0, len(raw)
         while at < end:
@@ -128,7 +130,7 @@ class _Reader:
 
 
 class _Node:
-    """An operation in a graph. Its inputs include those of the graphs nested in it."""
+    """An operation in a graph. Its inputs include those of nested graphs."""
 
     def __init__(self, reader: _Reader, raw: Buffer, depth: int) -> None:
         fields = reader.fields(raw)
@@ -150,7 +152,7 @@ class _Node:
 
 
 class _Graph:
-    """A graph of operations, with its nodes in execution order and its weights."""
+    """A graph of operations, with its weights."""
 
     def __init__(self, reader: _Reader, raw: Buffer, depth: int = 0) -> None:
         if depth > _MAX_NESTED_GRAPHS:
@@ -184,7 +186,7 @@ class _Graph:
         return found[::-1]
 
     def constants(self) -> set[str]:
-        """Return the names of the values that don't depend on the inputs and aren't random."""
+        """Return the names of the values that are the same in every run."""
         names = {*self._weights, ""}
         for node in self.nodes:
             if names.issuperset(node.inputs) and not node.operator.startswith(_RANDOM_PREFIX):
@@ -242,7 +244,7 @@ def _names(fields: Iterable[Field], field_number: int) -> list[str]:
 
 
 def _parse_integer(raw: Buffer, at: int) -> tuple[int, int]:
-    """Decode the integer at an index. Return it with the index of the byte after it."""
+    """Decode an integer, and return it with the index of the next byte."""
     result = shift = 0
     while at < len(raw) and shift < 64:  # Longer integers aren't valid.
         byte = raw[at]

@@ -1,4 +1,4 @@
-"""A running `talk fleet watch`."""
+"""`talk fleet watch` as a process."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ if TYPE_CHECKING:
     from tests.support.processes import Finished, Process
 
 
-class Watching:
-    """A `talk fleet watch` that has printed its first line."""
+class WatchProcess:
+    """A running `talk fleet watch` that has printed its first line."""
 
-    def __init__(self, desk: Desk, *words: str) -> None:
+    def __init__(self, desk: Desk, *arguments: str) -> None:
         self._desk = desk
-        self.process: Process = desk.start(*words, "fleet", "watch")
+        self.process: Process = desk.start(*arguments, "fleet", "watch")
         self.lines: list[str] = []
         self.until("")
 
-    def until(self, words: str) -> str:
-        """Return the next line with these words."""
+    def until(self, text: str) -> str:
+        """Return the next line that contains this text."""
         assert self.process.stdout
         for line in self.process.stdout:
             self.lines.append(line.rstrip("\n"))
-            if words in line:
+            if text in line:
                 return self.lines[-1]
-        raise AssertionError(f"it ended without '{words}': {self.lines}")
+        raise AssertionError(f"it ended without '{text}': {self.lines}")
 
     def end(self) -> Finished:
         self.process.send_signal(signal.SIGINT)

@@ -1,11 +1,11 @@
-"""A robot without bridge and server: it answers requests as a test wants it."""
+"""A robot without a bridge or a server. The test chooses its replies."""
 
 from __future__ import annotations
 
 import json
 from typing import TYPE_CHECKING, Any
 
-from tests.fleet import told
+from tests.fleet import publish
 from tests.support.mqtt import Listener
 
 if TYPE_CHECKING:
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from tests.support.broker import Broker
 
 
-class Pretended(Listener):
-    """A robot at a broker, online until it is closed."""
+class FakeRobot(Listener):
+    """A robot that is online until it is closed."""
 
     def __init__(
         self,
@@ -26,17 +26,17 @@ class Pretended(Listener):
         answer: Callable[[dict[str, Any]], Sequence[dict[str, Any]]],
         groups: Sequence[str] = (),
     ) -> None:
-        """`answer` returns the lines of the answer to a request."""
+        """`answer` returns the lines of the reply to a request."""
         self._robot, self._answer_to = name, answer
-        topics = [f"talk/robot/{name}/request/+", *(f"talk/group/{each}/request/+" for each in ("all", *groups))]
+        topics = [f"talk/robot/{name}/request/+", *(f"talk/group/{group}/request/+" for group in ("all", *groups))]
         super().__init__(broker, *topics)
-        told.presence(self, name, groups=groups)
+        publish.presence(self, name, groups=groups)
 
-    def __enter__(self) -> Pretended:
+    def __enter__(self) -> FakeRobot:
         return self
 
     def close(self) -> None:
-        """Have the broker forget the robot, and end the connection."""
+        """Clear the robot's presence, and disconnect."""
         if self.ended is None:
             self.publish(f"talk/robot/{self._robot}/presence", b"", retain=True)
         super().close()

@@ -1,4 +1,4 @@
-"""An engine process started the way the server starts it, driven by the protocol's messages."""
+"""An engine process that is started as by the server, and controlled with the protocol's messages."""
 
 from __future__ import annotations
 
@@ -19,24 +19,22 @@ if TYPE_CHECKING:
 
 _E = TypeVar("_E", bound=protocol.Event)
 
-#: Seconds after which a message is late on the busiest machine.
+#: Seconds after which a message is late even on a busy machine.
 PATIENCE = 20.0
-#: Words a minute in tests of something else: a sentence takes less than half as long as at talk's own rate. Another
-#: driver is told its own rate, which it need not set.
+#: Words per minute. Most tests use the fast rate, which more than halves the time of a sentence. Drivers other than
+#: espeak get the usual rate, because they may be unable to set another one.
 FAST = 450
 USUAL = 200
-#: Seconds between two signs of life in tests that wait for one to let some time pass.
+#: Seconds between signs of life in tests that wait for one to let some time pass.
 SOON = 0.1
-
-
-#: Wraps a function of the package.
-_FIRST = """
+#: Wraps a function of `talkcli.engine.child` with code that runs first.
+_BEFORE_CALL = """
 import importlib, sys, threading, time
 def wrap(module, path):
     *names, name = path.split(".")
     owner = importlib.import_module("talkcli.engine.child." + module)
-    for each in names:
-        owner = getattr(owner, each)
+    for part in names:
+        owner = getattr(owner, part)
     original, seen = getattr(owner, name), []
     def wrapped(*arguments, **more):
         {does}
@@ -46,16 +44,18 @@ wrap({module!r}, {path!r})
 """
 
 
-def first(function: str, does: str) -> str:
-    """Return code that has a function of the engine, as "players.pulse:PulsePlayer.offer", do something first.
+def before_call(function: str, does: str) -> str:
+    """Return code that makes a function of the engine do something else first.
 
-    That is a line of Python, which sees its `arguments`, and a list `seen` that stays.
+    Args:
+        function: the name of the function, such as "players.pulse:PulsePlayer.offer".
+        does: a line of Python. It can use the call's `arguments`, and a list `seen` that all calls share.
     """
     module, _, path = function.partition(":")
-    return _FIRST.format(module=module, path=path, does=does)
+    return _BEFORE_CALL.format(module=module, path=path, does=does)
 
 
-class Spawned:
+class Engine:
     """A running engine process. Leaving the context kills it and its player."""
 
     def __init__(
@@ -73,9 +73,12 @@ class Spawned:
         list_voices: bool = True,
         alive_every: float | None = None,
     ) -> None:
-        """`limits` replaces constants of the playback, `before` is code that runs in the process first.
+        """Start the process.
 
-        `alive_every`: seconds between signs of life, if not the protocol's.
+        Args:
+            limits: new values for constants of the playback.
+            before: code that the process runs first.
+            alive_every: seconds between signs of life, or None for the protocol's interval.
         """
         self.events: list[protocol.Event] = []
         self._rate = FAST if driver in (None, "espeak") else USUAL
@@ -83,7 +86,7 @@ class Spawned:
         self._ahead: list[protocol.Event | None] = []
         self._pauses = 0
         self._unfinished: set[str] = set()
-        self._socket, theirs = socket.socketpair()
+        self._socket, child_socket = socket.socketpair()
         self._socket.settimeout(PATIENCE)
         self.liveness, inherited = os.pipe()
         settings = "".join(f"playback.{name} = {value}\n" for name, value in (limits or {}).items())
@@ -91,10 +94,10 @@ class Spawned:
             settings += f"from talkcli.engine import protocol\nprotocol.ALIVE_INTERVAL_S = {alive_every}\n"
         path = f"import sys\nsys.path[:] = {sys.path!r}\n"
         code = f"{path}{before}\nfrom talkcli.engine.child import playback\n{settings}"
-        with theirs:
+        with child_socket:
             self.process = subprocess.Popen(
                 [sys.executable, "-c", f"{code}from talkcli.engine.child.main import main\nmain()"],
-                stdin=theirs.fileno(),
+                stdin=child_socket.fileno(),
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,
                 pass_fds=[inherited],
@@ -104,8 +107,8 @@ class Spawned:
         os.close(inherited)
         self.send(protocol.Configure(server or os.getpid(), driver, player, device, voice, lead_in, list_voices))
 
-    def __enter__(self) -> Spawned:
-        """Wait for the first event, behind which it takes commands; it can still be read."""
+    def __enter__(self) -> Engine:
+        """Wait until the process accepts commands. The first event remains to be read."""
         self._ahead.append(self.event())
         return self
 
@@ -119,20 +122,20 @@ class Spawned:
 
     @property
     def idle(self) -> bool:
-        """Whether it runs, and all its goals have ended."""
+        """Whether the process is running and all its goals have ended."""
         return self.process.poll() is None and not self._unfinished
 
     def send(self, *commands: protocol.Command) -> None:
-        """Send commands in one piece, so that they are read at once."""
-        self._unfinished.update(each.id for each in commands if isinstance(each, protocol.Speak))
+        """Send commands in one piece, so that the process reads them together."""
+        self._unfinished.update(command.id for command in commands if isinstance(command, protocol.Speak))
         self._socket.sendall(b"".join(map(protocol.encode, commands)))
 
     def leave(self) -> None:
-        """Send nothing more, and let the process end; its events can still be read."""
+        """Close the sending side, so that the process ends. Its events can still be read."""
         self._socket.shutdown(socket.SHUT_WR)
 
     def hang_up(self) -> None:
-        """Close the connection both ways, as the kernel does when the server dies."""
+        """Close the connection in both directions, as the kernel does when the server dies."""
         self._socket.shutdown(socket.SHUT_RDWR)
 
     def say(
@@ -148,39 +151,39 @@ class Spawned:
         voice_only: bool | None = None,
     ) -> None:
         if voice_only is None:
-            voice_only = voice is not None and is_neural(voice)  # what is asked for is heard, or it fails
+            voice_only = voice is not None and is_neural(voice)  # without a fallback to espeak
         rate = rate or self._rate
         self.send(
             protocol.Speak(goal, text, rate, 1.0, voice, pitch, next_waits, lead_in=lead_in, voice_only=voice_only)
         )
 
     def pause(self, goal: str = "g1") -> float:
-        """Hold the sentence and return the seconds until the process said that it is silent."""
-        asked = time.monotonic()
+        """Pause the sentence, and return the seconds until the process confirmed silence."""
+        requested_at = time.monotonic()
         self._pauses += 1
         self.send(protocol.Hold(goal, self._pauses))
         assert self.until(protocol.Held) == protocol.Held(goal, self._pauses)
-        return time.monotonic() - asked
+        return time.monotonic() - requested_at
 
     def resume(self, goal: str = "g1") -> None:
         self.send(protocol.Continue(goal))
 
     def until_word(self, number: int = 1) -> protocol.Word:
-        """Return the word of this number, or the first one after it."""
+        """Wait for the word with this number or a later one, and return it."""
         while (word := self.until(protocol.Word)).number < number:
             pass
         return word
 
     def stop(self, goal: str = "g1") -> float:
-        """Stop the sentence and return the seconds until the process said that it has ended."""
-        asked = time.monotonic()
+        """Stop the sentence, and return the seconds until the process confirmed its end."""
+        requested_at = time.monotonic()
         self.send(protocol.Stop(goal))
         ended = self.until(protocol.Ended)
         assert (ended.id, ended.outcome) == (goal, protocol.OUTCOME_STOPPED), ended
-        return time.monotonic() - asked
+        return time.monotonic() - requested_at
 
     def event(self) -> protocol.Event | None:
-        """Return the next event, None at the end of the connection."""
+        """Return the next event, or None at the end of the connection."""
         if self._ahead:
             return self._ahead.pop()
         while b"\n" not in self._rest:
@@ -203,7 +206,7 @@ class Spawned:
         raise AssertionError(f"no {kind.__name__} before the process ended: {self.errors()}")
 
     def spoken(self, text: str, goal: str = "g1", **more: Any) -> protocol.Ended:
-        """Say a sentence and return how it ended; `more`: as in `say`."""
+        """Say a sentence with the options of `say`, and return the event of its end."""
         self.say(text, goal, **more)
         ended = self.until(protocol.Ended)
         assert ended.id == goal, ended
@@ -213,17 +216,17 @@ class Spawned:
         return [event for event in self.events if isinstance(event, protocol.Word) and event.id == goal]
 
     def errors(self) -> str:
-        """Return the standard error of the process; waits for its end."""
+        """Wait for the end of the process, and return its standard error."""
         assert self.process.stderr is not None
         return self.process.stderr.read().decode()
 
     def errors_line(self) -> str:
-        """Return the next line that the process writes to standard error; waits for it."""
+        """Wait for the next line on the process's standard error, and return it."""
         assert self.process.stderr is not None
         return self.process.stderr.readline().decode().strip()
 
     def all_gone(self, seconds: float = 2.0) -> bool:
-        """Return whether the process and its player are gone within that time."""
+        """Return whether the process and its player end within this time."""
         os.set_blocking(self.liveness, False)
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -234,16 +237,16 @@ class Spawned:
         return False
 
 
-class Shared:
-    """An engine process for several tests. After a failure or an unfinished goal, the next test gets a new process."""
+class SharedEngine:
+    """An engine process for several tests. After a failed test or an unfinished goal, a new process replaces it."""
 
-    def __init__(self, start: Callable[[], Spawned]) -> None:
+    def __init__(self, start: Callable[[], Engine]) -> None:
         self._start, self._stack = start, contextlib.ExitStack()
-        self._engine: Spawned | None = None
+        self._engine: Engine | None = None
         self._failed = 0
 
-    def take(self, failed: int) -> Spawned:
-        """Return an idle process, without the events of the tests before. So many tests have `failed` until now."""
+    def take(self, failed: int) -> Engine:
+        """Return an idle process without old events. `failed` is the number of tests that have failed so far."""
         if self._engine is None or not self._engine.idle or failed != self._failed:
             self.close()
             self._engine, self._failed = self._stack.enter_context(self._start()), failed
