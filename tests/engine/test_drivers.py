@@ -18,6 +18,7 @@ from talkcli.engine.child.driver import register_driver
 from talkcli.engine.child.players.base import CannotSpeak
 from talkcli.engine.child.players.chooser import PlayerChooser
 from talkcli.engine.voices import UnknownVoice
+from talkcli.frozen import replace
 from tests.engine.process import Engine, SharedEngine
 from tests.engine.test_synthesizer_contract import Scripted
 from tests.support.timing import assert_within, limits
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from typing import Any
 
+    from talkcli.engine.child.cutting import GrowingText
     from talkcli.engine.child.players.base import Interest
     from talkcli.engine.child.runner import GoalRunner
     from talkcli.engine.child.synthesizers.base import SampleSink, SpeechSettings, Synthesizer
@@ -227,7 +229,10 @@ def test_a_stop_ends_a_paused_driver(silent: bool) -> None:
         else:
             engine.send(protocol.Hold("g1", 1))
         engine.send(protocol.Stop("g1"))
-        assert engine.until(protocol.Ended) == protocol.Ended("g1", protocol.OUTCOME_STOPPED)
+        ended = engine.until(protocol.Ended)
+        assert replace(ended, heard=None) == protocol.Ended("g1", protocol.OUTCOME_STOPPED)
+        assert ended.heard is not None
+        assert ended.heard > 0
         assert engine.spoken("yes", "g2").outcome == protocol.OUTCOME_COMPLETED
         assert _driver_texts(engine) == ["battery low, please come home", "yes"]
 
@@ -353,6 +358,8 @@ class Recorder:
         self.notifications: list[tuple[str, dict[str, Any]]] = []
         self.position: float | None = None
         self.duration: float | None = None
+        self.heard: float | None = None
+        self.growing_text: GrowingText | None = None
         #: the position and the duration at each notification
         self.times: list[tuple[float | None, float | None]] = []
         #: called for each word, and after each wait
