@@ -112,7 +112,7 @@ def test_nothing_is_sent_to_a_server_that_lacks_a_feature() -> None:
         env = clean_environment(os.path.dirname(path), {"TALK_SOCKET": path})
         done = run([*TALK, "say", "--markdown", "**hello**"], env)
     assert (done.code, done.out) == (9, ""), done
-    assert done.err == "talk: the server is 0 and can't take Markdown: restart it\n"
+    assert done.err == "talk: the server (version 0) does not support Markdown; restart it\n"
 
 
 def test_a_request_is_sent_again_if_the_server_hangs_up() -> None:

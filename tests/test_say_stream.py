@@ -81,7 +81,7 @@ def test_invalid_bytes_are_reported_once(talk: Talk) -> None:
 
 
 def test_the_producer_is_stopped_if_the_goal_ends(talk: Talk) -> None:
-    """The producer writes for ever, so it can only end by SIGPIPE."""
+    """The producer never stops writing, so only SIGPIPE can end it."""
     code = (
         "import signal, sys; signal.signal(signal.SIGPIPE, signal.SIG_DFL)\nwhile True: sys.stdout.write('one two. ')"
     )
@@ -113,9 +113,9 @@ def test_ctrl_c_cancels_the_goal(talk: Talk) -> None:
         typing.type(text)
         goal_id = typing.line().split()[0]
         talk.watcher.wait_for(goal_id, "ACTIVE")
-        began = time.monotonic()
+        started_at = time.monotonic()
         code, _, err = typing.end(signal.SIGINT)
-        assert_within(time.monotonic() - began, 1, "the end after Ctrl-C")
+        assert_within(time.monotonic() - started_at, 1, "the end after Ctrl-C")
         assert code == 128 + signal.SIGINT
         assert err.startswith(f"talk: {goal_id}: ")
         assert talk.goal(goal_id)["state"] == "PREEMPTED"

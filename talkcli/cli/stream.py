@@ -1,7 +1,7 @@
 """Code for `talk say --stream`, which speaks standard input while it arrives.
 
-One thread reads the input, sends it, and follows the goal. While the server holds back its reply, because much of the
-text has not been heard, no input is read, so that the program that writes it waits, too.
+One thread reads the input, sends it, and follows the goal. While much of the text has not been heard, the server holds
+back its reply. In this time, no input is read, so the program that writes the input has to wait, too.
 """
 
 from __future__ import annotations
@@ -40,7 +40,10 @@ class InputDecoder:
         self.problem: str | None = None
 
     def decode(self, data: bytes) -> str:
-        """Return the text that follows from the next bytes. Empty bytes mark the end of the input."""
+        """Return the text that follows from the next bytes.
+
+        Empty bytes mark the end of the input.
+        """
         added = self._decoder.decode(data, final=not data)
         text = self._text + self._line_breaks + added
         if not added.isprintable() and any(map(is_bad_byte, added)):
@@ -55,10 +58,13 @@ class InputDecoder:
 
 
 class StreamSpeaker(InputSpeaker):
-    """Speaks standard input as one goal, whose text grows."""
+    """Speaks standard input as one goal with a growing text."""
 
     def _run_connected(self) -> int:
-        """Wait for the first text, send the goal and the rest of the input, and return the exit code."""
+        """Wait for the first text, and send the goal and the rest of the input.
+
+        Return the exit code.
+        """
         reporter, self._decoder = self._reporter, InputDecoder()
         self._speech = self._client.stream(feedback=self._feedback.shows_events, **self._goal_options)
         self._text = self._speech._text
@@ -79,7 +85,9 @@ class StreamSpeaker(InputSpeaker):
         return code if goal.state.terminal else EXIT_OK
 
     def _follow(self, goal: GoalHandle) -> None:
-        """Send the input as it arrives until it ends. With --wait, also show the goal's events until the goal ends.
+        """Send the input as it arrives, until it ends.
+
+        With --wait, also show the goal's events until the goal ends.
 
         Raises:
             TimeoutError: the goal has not ended in time.
@@ -105,7 +113,10 @@ class StreamSpeaker(InputSpeaker):
         self._show_events(goal)
 
     def _add_input(self, data: bytes | None) -> None:
-        """Add input to the text. Empty data means the end of the input, and None means that there is no input."""
+        """Add input to the text.
+
+        Empty data means the end of the input. None means that no input has arrived.
+        """
         if data is None:
             return
         known_problem = self._decoder.problem
@@ -115,19 +126,22 @@ class StreamSpeaker(InputSpeaker):
         self._text.ended = not data
 
     def _process_answer(self, exchange: Exchange) -> None:
-        """Process the answer to a request to add text. Raises RequestRefused if it only concerns this text."""
+        """Process the answer to a request to add text.
+
+        Raises RequestRefused if the server refused only this text.
+        """
         try:
             self._connection.answer(exchange)
         except TalkError as error:
             self._speech._process_error(error)
 
     def _show_events(self, goal: GoalHandle) -> None:
-        """Show the goal's new events with --wait, and forget them otherwise."""
+        """Show the goal's new events with --wait. Otherwise, forget them."""
         while event := goal.poll():
             if self._wait:
                 show_if_possible(self._feedback.show, goal.goal, event)
 
 
 def _has_news(goal: GoalHandle, exchange: Exchange | None) -> bool:
-    """Return whether the goal has an event, or whether a request was answered."""
+    """Return whether the goal has an event or the request was answered."""
     return goal._has_event() or (exchange is not None and exchange.over)

@@ -214,7 +214,7 @@ class Client:
         feedback: bool = False,
         patient: bool = False,
     ) -> SpeechStream:
-        """Return a stream, whose text is spoken while it is written.
+        """Return a stream whose text is spoken while it is written.
 
             with talk.stream(preempt=True) as speech:
                 for token in model:
@@ -225,9 +225,9 @@ class Client:
         The goal is sent with the first text that can be spoken. A text has at most 50,000 characters. If the connection
         breaks, the client reconnects and continues the text.
 
-        The arguments are those of `say`, and `stall`: the seconds for which the goal waits for more text after all of
-        it was spoken, 1 to 60. After that, it is ABORTED with the reason `text_stalled`. A throttle needs a key,
-        because the whole text isn't known yet. If `id` is None, the client chooses an id.
+        The arguments are those of `say`, and `stall`. If all of the text was spoken and no more text arrives for this
+        time (1 to 60 seconds), the goal is ABORTED with the reason `text_stalled`. A throttle needs a key, because the
+        whole text isn't known yet. If `id` is None, the client chooses an id.
 
         Raises:
             UsageError: a value is out of its range.

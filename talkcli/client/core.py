@@ -212,7 +212,10 @@ class TrackedGoal:
             listeners.add(self)
 
     def _grow(self, text: str) -> None:
-        """Add text that the server has accepted, unless the goal has ended. The Result has the whole text."""
+        """Add text that the server has accepted, unless the goal has ended.
+
+        The Result has the whole text.
+        """
         self._update(replace(self.goal, text=(self.goal.text or "") + text))
 
     def _fail(self, error: TalkError) -> None:
@@ -274,7 +277,7 @@ class TrackedGoal:
 
 @frozen
 class ServerInfo:
-    """A server's description of itself in its greeting, or in the presence of a robot."""
+    """The description of a server in its greeting or in its robot's presence."""
 
     boot: str = ""
     pid: int | None = None
@@ -521,15 +524,18 @@ class ClientCore:
         return Lost(words) if isinstance(request, self.lasting) else ServerUnavailable(words)
 
     def unsupported(self, request: Request) -> TalkError | None:
-        """Return an error if the server is known to lack a feature that a request needs, otherwise None."""
+        """Return an error if the server lacks a feature that a request needs.
+
+        Return None if the server's features are unknown.
+        """
         features = self.server.features
         missing = missing_features(write_request(request), features) if features is not None else []
         if not missing:
             return None
         from talkcli.terminal.text import printable  # rarely needed, and slow to import
 
-        version, ability = printable(self.server.version), FEATURES[missing[0]].ability
-        return ProtocolMismatch(f"the server is {version} and can't {ability}: restart it")
+        version, name = printable(self.server.version), FEATURES[missing[0]].name
+        return ProtocolMismatch(f"the server (version {version}) does not support {name}; restart it")
 
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
         """Return the error for a reply that refuses a request.

@@ -1,4 +1,4 @@
-"""The client's side of a text that grows, without I/O.
+"""The client's side of a growing text, without I/O.
 
 `TextSender` decides which request sends the next part of the text. The caller sends one request at a time, and reports
 the answer. `stream` is the blocking shell around it.
@@ -11,10 +11,13 @@ from talkcli.goals.options import MAX_TEXT_CHARS, Append, Say, is_visible
 
 
 class TextSender:
-    """A growing text, of which the server has a part, and the requests that send the rest."""
+    """A growing text, and the requests that send it to the server."""
 
     def __init__(self, say: Say) -> None:
-        """Start with an empty text. `say` has the options of the goal."""
+        """Start with an empty text.
+
+        `say` has the options of the goal.
+        """
         self._say = say
         #: the text that the server doesn't have yet, as far as it is known
         self._unsent = ""
@@ -43,7 +46,10 @@ class TextSender:
         return self._open
 
     def accepted(self, goal_id: str) -> str:
-        """Record that the server has accepted the open request, and return the text that it has added."""
+        """Record that the server has accepted the open request.
+
+        Return the text of this request.
+        """
         request = self._open
         assert request
         self.refused()
@@ -58,7 +64,7 @@ class TextSender:
             self._unsent, self._open = self._unsent[len(self._open.text) :], None
 
     def _create_request(self) -> Say | Append | None:
-        """Return a request for the text that can be sent now, or None."""
+        """Return a request for the text that can be sent now, if any."""
         text = self._unsent[:MAX_TEXT_CHARS]
         is_last = self.ended and len(text) == len(self._unsent)
         if not is_last and "\ud800" <= text[-1:] <= "\udbff":  # the other half of a surrogate pair follows
@@ -74,8 +80,8 @@ class TextSender:
 def _join_surrogates(text: str) -> str:
     """Replace surrogate pairs by the characters that they stand for.
 
-    Programs that decode JSON in pieces may pass such halves. The server joins the halves in a request, so that both
-    sides would count a different number of characters.
+    Programs that decode JSON in pieces may pass the halves of a pair separately. The server joins the halves that come
+    in one request, so it would count fewer characters than this client.
     """
     try:
         text.encode()

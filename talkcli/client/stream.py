@@ -24,16 +24,21 @@ _MAX_RESENDS = 5
 
 
 class SpeechStream:
-    """A text that is spoken while it is written. `Client.stream` creates it.
+    """A text that is spoken while it is written.
 
-    It is a context manager. When the block ends, the text is complete. If an exception ends the block, the goal is
-    ABORTED at once with the reason `broken_off`, or RECALLED if it hasn't started.
+    `Client.stream` creates the stream.
+
+    A stream is a context manager. When the block ends, the text is complete. If an exception ends the block, the goal
+    is ABORTED at once with the reason `broken_off`, or RECALLED if it hasn't started.
 
     Only one thread at a time may write. Any thread may use the goal's handle.
     """
 
     def __init__(self, connection: Connection, say: Say) -> None:
-        """Initialize a stream without sending anything. `say` has the options of the goal."""
+        """Initialise a stream without sending anything.
+
+        `say` has the options of the goal.
+        """
         #: the handle of the goal, or None until there is text that can be spoken
         self.goal: GoalHandle | None = None
         self._connection = connection
@@ -61,9 +66,11 @@ class SpeechStream:
         return self._send()
 
     def wait(self, timeout: float | None = None) -> Goal | None:
-        """Wait until the goal has ended, and return it, or return None if there is no goal.
+        """Wait until the goal has ended, and return it.
 
-        Call this after the block. The arguments and errors are those of `GoalHandle.wait`.
+        Return None if there is no goal.
+
+        Call this method after the block. The arguments and errors are those of `GoalHandle.wait`.
         """
         return self.goal.wait(timeout) if self.goal else None
 
@@ -106,7 +113,10 @@ class SpeechStream:
         return not self._stopped
 
     def _begin_goal(self, request: Say) -> GoalHandle:
-        """Send the goal with the beginning of its text, wait for the server's answer, and return the handle."""
+        """Send the goal with the beginning of its text, and return its handle.
+
+        Wait for the server's answer.
+        """
         handle = GoalHandle(self._connection, Goal("", State.PENDING))
 
         def on_reply(reply: JsonObject, _: list[JsonObject]) -> None:
@@ -124,7 +134,7 @@ class SpeechStream:
         self.goal._grow(self._text.accepted(self.goal.id))
 
     def _process_error(self, error: TalkError) -> None:
-        """Record that the goal takes no more text, because a request to add text has failed.
+        """Record that a request to add text has failed, so that the goal takes no more text.
 
         Raises:
             RequestRefused: the error only concerns the last text.

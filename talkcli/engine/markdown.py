@@ -86,7 +86,9 @@ _EMPHASIS = {
 
 
 class MarkdownReader:
-    """Replaces the marks in a Markdown text with blanks, while the text arrives in pieces of any size.
+    """Replaces the marks in a Markdown text with blanks.
+
+    The text may arrive in pieces of any size.
 
     The results joined have the length of the text so far, except for an end that can't be read yet, such as a link
     without its address. They don't depend on how the text was divided, so a caller may cut them anywhere.
@@ -113,7 +115,10 @@ class MarkdownReader:
         self._last = ""
 
     def read(self, text: str, *, ended: bool = False) -> str:
-        """Add text, and return what can be spoken of it and of earlier text. With `ended`, return all of the rest."""
+        """Add text, and return what can be spoken of it and of earlier text.
+
+        With `ended`, return the whole rest.
+        """
         self._text += text
         self._ended = ended
         partial = _PARTIAL_TOKEN.search(self._text, max(self._at, len(self._text) - _MAX_SPAN_CHARS))
@@ -129,7 +134,10 @@ class MarkdownReader:
         return "".join(found)
 
     def _step(self) -> str | None:
-        """Return the next token without its marks, or the text before it, or None if more text is needed."""
+        """Return the next token without its marks, or the text before it.
+
+        Return None if more text is needed.
+        """
         text, at = self._text, self._at
         token = _TOKEN.search(text, at, self._known)
         start = token.start() if token else self._known
@@ -150,7 +158,7 @@ class MarkdownReader:
         return self._read_mark(kind, token)
 
     def _begin_line(self, newline: str) -> str | None:
-        """Return a newline or a pause, and what is left of the marks at the beginning of the next line."""
+        """Return the replacement for a newline and for the marks after it."""
         text, at, before = self._text, self._at + len(newline), self._kind
         if not self._ended and (at == len(text) or _PARTIAL_LINE.match(text, at)):
             return None
@@ -178,7 +186,10 @@ class MarkdownReader:
         return newline + marks
 
     def _read_block(self) -> str | None:
-        """Return blanks for a line in a code block, and leave the code block at its end."""
+        """Return blanks for a line in a code block.
+
+        Leave the code block at its end.
+        """
         text, at = self._text, self._at
         end = text.find("\n", at)
         line = text[at : end if end >= 0 else len(text)]
@@ -192,7 +203,10 @@ class MarkdownReader:
         return " " * (len(line) + (end >= 0))
 
     def _read_span(self, kind: str, token: re.Match[str]) -> str | None:
-        """Return what is left of the beginning of a span, and remember its end. Return the whole span if it is code."""
+        """Return the replacement for the beginning of a span, and remember its end.
+
+        If the span is code, return the whole span.
+        """
         text, (start, end), mark = self._text, token.span(), token.group()
         if kind == "emphasis" and (_is_letter(text[start - 1 : start]) or text[end : end + 1] in " \t\n).,;:!?]}"):
             return mark
@@ -215,7 +229,7 @@ class MarkdownReader:
         return " " * len(mark)
 
     def _read_mark(self, kind: str, token: re.Match[str]) -> str:
-        """Return what is left of any other token."""
+        """Return the replacement for any other token."""
         text, (start, end), mark = self._text, token.span(), token.group()
         before, after = text[start - 1 : start] or "\n", text[end : end + 1] or "\n"
         kept = 0  # number of characters at the end of the token that aren't marks

@@ -116,7 +116,10 @@ class Speak:
 
 @frozen
 class Append:
-    """The command to add text to a goal that was sent with `Speak.more`. It is ignored if the goal has ended."""
+    """The command to add text to a goal that was sent with `Speak.more`.
+
+    It is ignored if the goal has ended.
+    """
 
     id: str
     text: str
@@ -278,7 +281,7 @@ class Word:
 
 @frozen
 class TextMissing:
-    """Everything was heard, and the next part of the text is missing, or the goal continues after that."""
+    """The goal became silent because text is missing, or it continues."""
 
     id: str
     missing: bool

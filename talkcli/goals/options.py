@@ -110,7 +110,7 @@ def _id_error(value: str) -> str | None:
 
 
 def _offset_error(value: int) -> str | None:
-    """Return an error message if an offset in a text is negative, or None."""
+    """Return an error message if an offset in a text is negative."""
     return None if value >= 0 else "must be 0 or more"
 
 
@@ -518,7 +518,7 @@ OPTIONS = (
         "aborted (`text_stalled`)",
         default=STALL_S,
         limits=(MIN_STALL_S, MAX_STALL_S),
-        help="With --stream, stop if no text arrives for SEC seconds. The time starts when all of it was spoken.",
+        help="With --stream, stop if no text arrives for SEC seconds. The time starts when everything was spoken.",
     ),
     Option(
         "format",
@@ -588,7 +588,7 @@ class Append:
     options: ClassVar[tuple[Option, ...]] = (
         Option("id", ID, "the goal", default="", default_words="required"),
         Option("text", TEXT, "the text to add", default=""),
-        Option("at", _OFFSET, "the length of the text so far. An addition that was sent before is then harmless"),
+        Option("at", _OFFSET, "the length of the text so far. With `at`, the same addition can be sent twice"),
         Option("end", FLAG, "whether the text is complete", default=False),
         Option("broken", FLAG, "whether the sender gives up, so that the goal is stopped at once", default=False),
     )

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from talkcli.goals.options import Append, Cancel, Say, Set
 
-_BROKEN_OFF = "its sender left before the text ended"
+_BROKEN_OFF = "the sender left before the text ended"
 #: Time limit for the engine to become silent after a stop. Every cancel must be answered within 2 s.
 CONFIRM_SILENCE_S = 1.9
 
@@ -269,7 +269,9 @@ class Scheduler:
         return result
 
     def append(self, record: Record, addition: Append, now: Now) -> list[Effect]:
-        """Add text to a goal whose text grows, or end its text. An addition that was sent before changes nothing.
+        """Add text to a growing text, or end it.
+
+        An addition that was sent before changes nothing. Return the effects.
 
         Args:
             record: the goal.
@@ -305,7 +307,10 @@ class Scheduler:
         return [EngineOrder(record, Order.APPEND)] if record.state is State.ACTIVE and (added or addition.end) else []
 
     def producer_left(self, record: Record, now: Now) -> list[Effect]:
-        """Break off a text whose sender has left, but wait for a new connection if the sender chose the goal's id."""
+        """Break off a text whose sender has left.
+
+        If the sender chose the goal's id, wait for a new connection first. Return the effects.
+        """
         if not record.more or record.say.id is None:
             return self.break_off(record, now)
         if record not in self._orphans:
@@ -314,7 +319,10 @@ class Scheduler:
         return []
 
     def break_off(self, record: Record, now: Now, *, at_once: bool = False) -> list[Effect]:
-        """End a goal whose text will never be complete. Sentences that are complete are spoken, unless `at_once`."""
+        """End a goal whose text will never be complete.
+
+        Complete sentences are still spoken, unless `at_once` is set. Return the effects.
+        """
         self._adopt(record)
         if not (record.more and record.state in {State.PENDING, State.ACTIVE}):
             return []
@@ -812,13 +820,13 @@ class Scheduler:
         return [StateChange(record, State.PREEMPTING), EngineOrder(record, Order.STOP)]
 
     def _adopt(self, record: Record) -> None:
-        """Stop waiting for another connection that continues the text of a goal."""
+        """Stop waiting for a connection that continues the text of a goal."""
         if record in self._orphans:
             self._orphans.remove(record)
         record.orphaned_until = inf
 
     def _restart_stall(self, record: Record, now: Now) -> None:
-        """Allow the sender of a growing text its whole time again if the text is missing."""
+        """Restart the sender's time limit if text is missing."""
         record.stalls_at = now.monotonic + record.say.stall if record.waits else inf
 
     def _require_active(self, goal_id: str) -> Record:

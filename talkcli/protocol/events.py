@@ -146,7 +146,7 @@ class TextAdded:
 
 @frozen
 class TextMissing:
-    """Event sent when a goal becomes silent because the next part of its text is missing, and when it continues."""
+    """Event sent when a goal becomes silent because text is missing, and when it continues."""
 
     id: str
     #: whether the goal waits for text

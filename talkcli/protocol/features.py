@@ -18,19 +18,19 @@ if TYPE_CHECKING:
 class Feature:
     """A feature of the protocol."""
 
-    #: what a server without the feature can't do, for error messages
-    ability: str
+    #: what a server without the feature does not support, for error messages
+    name: str
     #: function that returns whether a request needs the feature
     is_needed: Callable[[JsonObject], bool]
 
 
 #: All features, by name. Never remove one.
 FEATURES = {
-    "append": Feature("take growing texts", lambda request: request.get("more") is True),
-    "markdown": Feature("take Markdown", lambda request: request.get("format") == "markdown"),
+    "append": Feature("growing texts", lambda request: request.get("more") is True),
+    "markdown": Feature("Markdown", lambda request: request.get("format") == "markdown"),
 }
 
 
 def missing_features(request: JsonObject, available: Collection[str]) -> list[str]:
-    """Return the names of the features that a request needs and that the server doesn't have."""
+    """Return the names of the features that a request needs, but the server lacks."""
     return [name for name, each in FEATURES.items() if name not in available and each.is_needed(request)]

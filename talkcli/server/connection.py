@@ -67,7 +67,7 @@ class Handler(Protocol):
         """Start to carry out a client's request."""
 
     def input_ended(self, connection: ClientConnection) -> None:
-        """Break off the texts that a client has not completed, because it will send nothing more."""
+        """Break off a client's incomplete texts, because it will send nothing more."""
 
     def is_waiting(self, connection: ClientConnection) -> bool:
         """Return whether a client is still waiting for a reply or an event."""

@@ -89,7 +89,7 @@ class Requests:
         self.input_ended(connection)
 
     def input_ended(self, connection: ClientConnection) -> None:
-        """Break off the texts that a client has not completed, because it will send nothing more."""
+        """Break off a client's incomplete texts, because it will send nothing more."""
         for record in [record for record, producer in self._producers.items() if producer is connection]:
             del self._producers[record]
             self._speech.apply(self._scheduler.producer_left(record, self._speech.advance_time()))
@@ -280,7 +280,9 @@ class Requests:
         pending.answer(length=len(record.say.text), state=record.state.name)
 
     def _require_producer(self, record: Record, connection: ClientConnection) -> None:
-        """Record that a connection adds text to a goal. Raises RequestRefused if another connection does so.
+        """Record which connection adds text to a goal.
+
+        Raises RequestRefused if another connection already does.
 
         A new connection may continue a text if the old one is gone and the sender chose the goal's id.
         """

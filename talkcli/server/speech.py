@@ -61,7 +61,7 @@ require_fields(protocol.Speak, ENGINE_OPTIONS)
 
 
 def unheard_chars(record: Record) -> int:
-    """Return how many characters of a goal's text have not been heard yet, although they can be spoken.
+    """Return how many characters that can be spoken have not been heard yet.
 
     If a goal waits for text, the rest of its text can't be spoken yet, or contains no words, such as a block of code.
     """
@@ -150,11 +150,11 @@ class Speech:
         return self._waiting_for_silence.setdefault(record, {})
 
     def waiting_for_hearing(self, record: Record) -> WaitingList:
-        """Return the requests that wait until more of this goal's text has been heard, or until it has ended."""
+        """Return the requests that wait until more of this goal's text has been heard."""
         return self._waiting_for_hearing.setdefault(record, {})
 
     def _waiting_for_room(self) -> Iterator[ClientConnection]:
-        """Yield the connections whose goals wait for room in the queue, or whose texts wait until they are heard."""
+        """Yield the connections whose goals wait for room in the queue, or whose texts wait to be heard."""
         for each in chain(self.waiting_for_room, *self._waiting_for_hearing.values()):
             yield each.connection
 

@@ -111,12 +111,15 @@ class Subscribers:
         _publish(event.to_json(), self._feedback_receivers([self._waiters.get(word.id, {})]), feedback=True)
 
     def text_added(self, goal_id: str, start: int, text: str, at: float) -> None:
-        """Publish to watching connections that a goal's text has grown. The new text begins at the offset `start`."""
+        """Publish to watching connections that a goal's text has grown.
+
+        The new text begins at the offset `start`.
+        """
         if self._watchers:
             _publish(TextAdded(goal_id, start, text, at, next(self._numbers)).to_json(), self._watchers)
 
     def text_missing(self, goal_id: str, at: float, *, waits: bool) -> None:
-        """Publish whether a goal waits for text to the connections that want feedback."""
+        """Publish to the connections that want feedback whether a goal waits for text."""
         event = TextMissing(goal_id, waits, at, next(self._numbers))
         _publish(event.to_json(), self._feedback_receivers([self._waiters.get(goal_id, {})]))
 

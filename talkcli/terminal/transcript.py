@@ -126,7 +126,10 @@ class Transcript:
         return []  # results aren't shown
 
     def _format_word(self, event: WordHeard, screen: Screen, now: float) -> list[str]:
-        """Remember that a word of the goal was heard, and return the line that shows it if words are shown."""
+        """Record that a word was heard.
+
+        Return the line that shows the word, if words are shown.
+        """
         self._heard.add(event.id)
         word = f"{printable(event.word)}{COLUMN_GAP}{event.time:.2f} s"
         return [self._head_columns(event.at or now, "word", None, event.id, screen) + word] * self._with_words
@@ -170,7 +173,9 @@ class Transcript:
         return self._format_goal(goal, event.state, at, screen)
 
     def _format_growth(self, event: TextAdded | TextMissing, screen: Screen, now: float) -> list[str]:
-        """Remember added text, and return the lines that show its new sentences, or that the goal waits for text.
+        """Record added text, and return the lines that show its new sentences.
+
+        If the goal waits for text, return a line that says so.
 
         A goal also waits before its first word, until there is enough text. This isn't shown.
         """
@@ -228,7 +233,10 @@ class Transcript:
 
 
 def _complete_chars(text: str, start: int) -> int:
-    """Return the offset after the last complete sentence that follows the offset `start`."""
+    """Return the offset after the last complete sentence.
+
+    The search begins at the offset `start`.
+    """
     found = _COMPLETE_SENTENCES.match(text, start)
     return found.end() if found else start
 

@@ -1,4 +1,4 @@
-"""Goals whose text grows, over the wire: who may add text, when replies come, and what happens if a client leaves."""
+"""Growing texts over the wire: who may add text, when replies come, and what happens if a client leaves."""
 
 from __future__ import annotations
 
@@ -132,10 +132,10 @@ def test_a_sender_that_gives_up_stops_the_goal_at_once(talk: Talk) -> None:
     with talk.connect() as client:
         goal_id = begin(client, "one two three four five six seven eight nine ten eleven twelve. " * 3)
         talk.watcher.wait_for_word(goal_id)
-        began = time.monotonic()
+        started_at = time.monotonic()
         assert client.request("append", id=goal_id, broken=True)["ok"]
         goal = result(client)
-    assert time.monotonic() - began < 2
+    assert time.monotonic() - started_at < 2
     assert (goal["state"], goal["reason"]) == ("ABORTED", "broken_off")
 
 

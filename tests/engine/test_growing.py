@@ -150,5 +150,5 @@ def test_another_driver_refuses_a_growing_text() -> None:
         grow(engine, "One. Two.")
         ended = engine.until(protocol.Ended)
         assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, Reason.BAD_OPTION)
-        assert ended.message == "this driver can't speak a text that grows; send it when it is complete"
+        assert ended.message == "this driver can't speak growing texts; send the text when it is complete"
         assert engine.spoken("Three.", "g2").outcome == protocol.OUTCOME_COMPLETED

@@ -188,7 +188,7 @@ def test_a_command_that_no_robot_can_run_is_a_usage_error(shared_robot: Robot, l
 def test_markdown_is_only_sent_to_a_robot_whose_server_supports_it(shared_robot: Robot) -> None:
     done = shared_robot.desk("say", "-w", "--markdown", "--id", "marked", "length=0 **hello**")
     assert (done.code, shared_robot.talk.goal("marked")["format"]) == (0, "markdown"), done
-    refused = "old-1: the server is 0.1.0 and can't take Markdown: restart it\n"
+    refused = "old-1: the server (version 0.1.0) does not support Markdown; restart it\n"
     with FakeRobot(shared_robot.broker, "old-1", lambda _: []) as robot, Desk(shared_robot.broker) as operator:
         presence(robot, "old-1", server={**SERVER, "features": []})
         done = operator.run("--robot", "old-1", "say", "--markdown", "**hello**")

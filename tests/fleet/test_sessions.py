@@ -297,7 +297,7 @@ def append(number: int, goal_id: str, **fields: object) -> dict[str, object]:
 
 @in_loop
 async def test_only_its_own_user_and_session_add_to_a_text(talk: Talk) -> None:
-    """The robot's own goals, and those of other users, can't be continued even after their senders have left."""
+    """Other users can't continue a text, even after its sender has left. Nobody can continue the robot's own texts."""
     anna = SessionsWithoutBroker(talk.socket)
     await begin(anna, "text")
     assert (await anna.ask(append(2, "text", text="Two.", at=5)))["length"] == 9

@@ -96,7 +96,7 @@ class Wire(contextlib.AbstractContextManager["Wire"]):
             self._socket.shutdown(socket.SHUT_RDWR)
 
     def half_close(self) -> None:
-        """Send nothing more."""
+        """Close the writing half of the connection."""
         self._socket.shutdown(socket.SHUT_WR)
 
     def close(self) -> None:

@@ -49,7 +49,10 @@ class Goal:
         self.more, self.broken, self.grown = not added.end, added.broken, True
 
     def take_words(self) -> list[tuple[int, int]]:
-        """Return the spans of the words that were not planned yet. The last one is left out if it may be incomplete."""
+        """Return the spans of words that are not planned yet.
+
+        The last word is left out if it may be incomplete.
+        """
         if self.grown:
             self.script, self.grown = script.Script(self.text), False
         spans = [] if "silent-start" in self.script else self.script.spans

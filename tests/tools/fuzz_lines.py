@@ -65,7 +65,7 @@ _REPLY_LIMIT_S = 60
 
 
 def additions(source: random.Random) -> Iterator[str]:
-    """Yield goals whose text grows, and additions to the latest ones, whose fields have all kinds of values."""
+    """Yield growing texts, and additions with valid and invalid fields to the latest ones."""
     count = 0
     while True:
         if source.random() < 0.2:

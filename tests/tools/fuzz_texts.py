@@ -309,7 +309,7 @@ def speak_all(texts: Iterable[Case], *, guarded: bool, seconds: float = float("i
 
 
 def split(text: str, source: random.Random) -> Iterator[str]:
-    """Yield pieces of a text with any number of characters in each. The first one is a valid text."""
+    """Yield pieces of a text. The first one is a valid text."""
     most, place, end = source.choice((1, 4, 8, 60)), 0, 0
     while end < len(text):
         end += source.randint(1, most)
@@ -329,7 +329,7 @@ def speak_growing(engine: PrivateEngine, goal: str, case: Case, pieces: Sequence
 
 
 def find_lost_text(text: str, pieces: Iterable[str], source: random.Random) -> str | None:
-    """Cut a text that grows by these pieces. Return a message if the parts don't contain the whole text."""
+    """Cut a text that grows by these pieces. Return an error message if text is lost."""
     growing, now, parts = GrowingText("", ended=False), 0.0, []
     for piece in (*pieces, ""):
         growing.append(piece, now)
@@ -341,7 +341,7 @@ def find_lost_text(text: str, pieces: Iterable[str], source: random.Random) -> s
 
 
 def find_misplaced_word(text: str, words: Iterable[protocol.Word]) -> str | None:
-    """Return a message if a word of a goal is not in its place."""
+    """Return an error message if a word of a goal is not in its place."""
     before = 0
     for number, word in enumerate(words, 1):
         if word.number != number or not before <= word.start < word.end <= len(text):

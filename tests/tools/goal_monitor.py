@@ -26,7 +26,7 @@ _LOG_GOALS = 2_200
 
 
 class GoalMonitor:
-    """Watches a server in a thread and checks the order of the states of each goal, and how its text grows."""
+    """Watches a server in a thread and checks each goal's states and how its text grows."""
 
     def __init__(self, path: str, *, restarts: bool = False) -> None:
         """With `restarts`, reconnect after the server has ended."""

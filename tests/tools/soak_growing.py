@@ -1,4 +1,4 @@
-"""A client of the soak whose texts grow while they are spoken, and end or break off in all ways."""
+"""A client of the soak test, whose texts grow, and end or break off in all ways."""
 
 from __future__ import annotations
 
@@ -34,42 +34,40 @@ _OPTIONS: tuple[dict[str, Any], ...] = (
 _numbers = itertools.count()
 
 
-def send_growing_texts(
-    talk: Talk, ends: Counter[tuple[str, str]], chance: random.Random, over: threading.Event
-) -> None:
-    """Send texts in pieces. Each goal must have one end, which says whether all of its text was spoken.
+def send_growing_texts(talk: Talk, ends: Counter[tuple[str, str]], rng: random.Random, over: threading.Event) -> None:
+    """Send texts in pieces. Each goal must end in time, with the right state.
 
-    `ends` counts the goals by what the client did at the end, and by their reason or state.
+    `ends` counts the goals by what the client did at the end, and by the reason or the state.
     """
     while not over.is_set():
         with talk.connect() as wire:
             while not over.is_set():
-                text = _GrowingText(talk, wire, chance, over)
+                text = _GrowingText(talk, wire, rng, over)
                 usable = text.send()
                 ends[text.way, text.end] += 1
-                over.wait(chance.random())
-                if not usable or chance.random() < 0.1:
+                over.wait(rng.random())
+                if not usable or rng.random() < 0.1:
                     break
 
 
 class _GrowingText:
-    """A goal whose text grows."""
+    """A goal with a growing text."""
 
-    def __init__(self, talk: Talk, wire: Wire, chance: random.Random, over: threading.Event) -> None:
-        self._talk, self._wire, self._chance, self._over = talk, wire, chance, over
-        self.way = chance.choice(["ended", *_WAYS])
-        self._options = chance.choice(_OPTIONS) | {"more": True, "wait": True, "rate": 450, "stall": 1}
-        if self.way == "continued" or chance.random() < 0.3:
+    def __init__(self, talk: Talk, wire: Wire, rng: random.Random, over: threading.Event) -> None:
+        self._talk, self._wire, self._rng, self._over = talk, wire, rng, over
+        self.way = rng.choice(["ended", *_WAYS])
+        self._options = rng.choice(_OPTIONS) | {"more": True, "wait": True, "rate": 450, "stall": 1}
+        if self.way == "continued" or rng.random() < 0.3:
             self._options["id"] = f"grows/{next(_numbers)}"
-        size, start = chance.choice((3, 5, 12)), chance.randrange(len(_STORY) - _LONGEST)
-        places = range(start, start + chance.randrange(10, _LONGEST), size)
+        size, start = rng.choice((3, 5, 12)), rng.randrange(len(_STORY) - _LONGEST)
+        places = range(start, start + rng.randrange(10, _LONGEST), size)
         self._begin, *self._pieces = [_STORY[at : at + size] for at in places]
         self._id = self.end = ""
         #: the text that the server has confirmed, and whether it has confirmed its end
         self._text, self._ended = self._begin, False
 
     def send(self) -> bool:
-        """Send the text, and check its end; return whether the connection can still be used."""
+        """Send the text, and check its end. Return whether the connection can still be used."""
         goal = self._wire.request("say", text=self._begin, **self._options)["goal"]
         self._id = goal["id"]
         if goal["state"] == "REJECTED":
@@ -86,12 +84,12 @@ class _GrowingText:
     def _append(self, text: str = "", **fields: Any) -> bool:
         """Add a piece, and return True."""
         if not self._over.is_set():
-            time.sleep(self._chance.choice(_INTERVALS_S))
-        self._note(self._wire.request("append", id=self._id, text=text, at=len(self._text), **fields), text, fields)
+            time.sleep(self._rng.choice(_INTERVALS_S))
+        self._record(self._wire.request("append", id=self._id, text=text, at=len(self._text), **fields), text, fields)
         return True
 
-    def _note(self, reply: Message, text: str, fields: dict[str, object]) -> None:
-        """Note what a reply confirms."""
+    def _record(self, reply: Message, text: str, fields: dict[str, object]) -> None:
+        """Record what a reply confirms."""
         if reply["ok"]:
             self._text += text
             self._ended = "end" in fields
@@ -107,7 +105,7 @@ class _GrowingText:
         return goal
 
     def _status(self) -> Message:
-        """Return the goal when it has ended, asked for on other connections."""
+        """Wait on other connections until the goal has ended, and return it."""
         end = time.monotonic() + PATIENCE_S
         while True:
             goal: Message = self._talk.request("status", id=self._id)["goal"]
@@ -117,14 +115,14 @@ class _GrowingText:
             time.sleep(0.05)
 
     def _check(self, goal: Message) -> None:
-        told = f"{self.way}, {len(self._text)} characters, {self._ended}: {goal}"
+        details = f"{self.way}, {len(self._text)} characters, {self._ended}: {goal}"
         self.end = goal["reason"] or goal["state"]
-        assert goal["state"] in TERMINAL, told
-        assert self.end != "nothing_to_say", told
-        assert self.end != "broken_off" or self.way in _BREAKS, told
-        assert (goal["text"], goal["more"], goal["waits"]) == (self._text, False, False), told
-        assert (goal["spoken_end"] or 0) <= len(self._text), told
-        assert goal["state"] != "SUCCEEDED" or (self._ended and goal["spoken_end"] == len(self._text)), told
+        assert goal["state"] in TERMINAL, details
+        assert self.end != "nothing_to_say", details
+        assert self.end != "broken_off" or self.way in _BREAKS, details
+        assert (goal["text"], goal["more"], goal["waits"]) == (self._text, False, False), details
+        assert (goal["spoken_end"] or 0) <= len(self._text), details
+        assert goal["state"] != "SUCCEEDED" or (self._ended and goal["spoken_end"] == len(self._text)), details
 
     # -- ways to end a text; each returns whether the connection can still be used
 
@@ -160,14 +158,14 @@ class _GrowingText:
         """Add more than may be unheard, and cancel the goal before the reply comes."""
         text = "long " * (MAX_UNHEARD_CHARS // 5 + 100)
         self._wire.send({"seq": -1, "request": "append", "id": self._id, "text": text})
-        time.sleep(self._chance.random())
+        time.sleep(self._rng.random())
         assert self._wire.request("cancel", ids=[self._id])["ok"]
         items = self._wire.items
         while not (replies := [each for each in items if each.get("seq") == -1]):
             message = self._wire.receive()
             (self._wire.events if "event" in message else items).append(message)
         items.clear()
-        self._note(replies[0], text, {})
+        self._record(replies[0], text, {})
         return True
 
 

@@ -4,8 +4,8 @@ The steps of a script are separated by semicolons. A single letter sends a goal 
 Every other step is a verb:
 
     a 5 preempt key=k ttl=1     send a goal of priority 5 that preempts; "queue" is preempt=False
-    a more stall=2; append a text=door at=4 end broken; left a         send a text that grows, add to it, and leave it
-    starved a; fed a            report as the engine that its text is missing, or isn't missing any more
+    a more stall=2; append a text=door at=4 end broken; left a    send a growing text, add to it, and leave
+    starved a; fed a            report as the engine that text is missing, or that it is no longer missing
     heard a; completed a; failed a; stopped a; deaf a   report this as the engine; * is the active goal
     cancel; cancel a b; cancel current before=c key=k
     wait 1; pass 1              let a second pass, with or without a tick

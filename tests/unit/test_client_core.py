@@ -124,8 +124,8 @@ def greet(core: ClientCore, boot: str = "4k7f", now: float = 2.0) -> None:
 @pytest.mark.parametrize(
     ("form", "features", "message"),
     [
-        ("markdown", (), "the server is 0.1.0 and can't take Markdown: restart it"),
-        ("markdown", ("other",), "the server is 0.1.0 and can't take Markdown: restart it"),
+        ("markdown", (), "the server (version 0.1.0) does not support Markdown; restart it"),
+        ("markdown", ("other",), "the server (version 0.1.0) does not support Markdown; restart it"),
         ("markdown", ("markdown", "other"), None),
         ("markdown", None, None),  # the bridge of a robot didn't tell, so the server may refuse the request
         ("text", (), None),
@@ -145,7 +145,7 @@ def test_a_waiting_request_fails_if_the_server_is_replaced_by_an_older_one(recon
     exchange = submit(reconnecting, Say("a", format="markdown"), on_failure=lambda _: None)
     other = submit(reconnecting, Status(), on_failure=lambda _: None)
     greet(reconnecting)
-    assert str(exchange.error) == "the server is 1.0 and can't take Markdown: restart it"
+    assert str(exchange.error) == "the server (version 1.0) does not support Markdown; restart it"
     assert [message["seq"] for message in send_all(reconnecting)] == [other.number]
 
 

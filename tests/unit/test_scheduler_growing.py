@@ -1,4 +1,4 @@
-"""Goals whose text grows: what may be added, and how they end if the rest of the text never comes."""
+"""Growing texts in the scheduler: what may be added, and how goals end if the rest of the text never comes."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def test_what_was_heard_of_a_broken_text_is_not_the_whole_text() -> None:
     robot = play("a more; append a text=bcdef; heard a; left a; completed a")
     goal = robot.goals["a"].snapshot()
     assert (goal.text, goal.spoken, goal.spoken_end) == ("abcdef", "abcd", 4)
-    assert goal.message == "speech failed: its sender left before the text ended"
+    assert goal.message == "speech failed: the sender left before the text ended"
 
 
 def test_a_text_that_breaks_off_before_its_first_sentence_is_complete_is_broken_off() -> None:

@@ -1,4 +1,4 @@
-"""Decides where a text that grows while it is spoken is cut into parts for the synthesizer.
+"""Decides where a growing text is cut into parts for the synthesizer.
 
 A part is a sentence if possible, because a synthesizer needs whole sentences for a natural melody. If the player is
 about to run out of sound, a part may be a clause or a few words. The language of the text isn't known here, so the
@@ -22,7 +22,7 @@ _LOW_BUFFER_S = 0.15
 _CLAUSE_CHARS, _PART_CHARS = 12, 300
 #: Length in which the longest abbreviation is found.
 _ABBREVIATION_CHARS = 24
-#: What has to pass before a stop may be taken for the end of a sentence.
+#: How long the text must not change before a stop counts as the end of a sentence.
 _NOTHING, _QUIET, _LONG_QUIET, _NEVER = range(4)
 
 _CLOSERS = r"[\"'”’“‘»«›‹)\]}*_~`」』）】》]*"
@@ -92,7 +92,10 @@ _REST = {
 
 
 class GrowingText:
-    """A text that grows while it is spoken, and the position up to which it was passed to the synthesizer."""
+    """A text that grows while it is spoken.
+
+    It knows the position up to which the text was passed to the synthesizer.
+    """
 
     def __init__(self, text: str, *, ended: bool) -> None:
         #: the whole text so far, with the sender's offsets
@@ -136,11 +139,11 @@ class GrowingText:
         A text that has ended is one part. Blanks between parts are skipped.
 
         Args:
-            now: The current time.
-            buffered: The remaining sound of the player in seconds, 0 if it is silent.
+            now: the current time.
+            buffered: the remaining sound of the player in seconds, 0 if it is silent.
 
         Returns:
-            Offsets in the text, or None if it is too early to cut or nothing is left.
+            offsets in the text. None if it is too early to cut or nothing is left.
         """
         end = self._find_end(now, now + buffered)
         if end is None:
@@ -149,7 +152,10 @@ class GrowingText:
         return start, end
 
     def due(self, now: float, buffered: float) -> float:
-        """Return the time at which there is a next part even if no text is added, or infinity."""
+        """Return the time at which there is a next part even if no text is added.
+
+        Return infinity if only more text can complete a part.
+        """
         silent_at = now + buffered
         changed_at = self._changed_at if self._changed_at is not None else now
         times = (changed_at + _QUIET_S, silent_at - _LOW_BUFFER_S, max(changed_at + _LONG_QUIET_S, silent_at))
@@ -159,7 +165,12 @@ class GrowingText:
         return float("inf")
 
     def _find_end(self, now: float, silent_at: float) -> int | None:
-        """Return the end of the next part at a time, given the time at which the player becomes silent."""
+        """Return the end of the next part, if the text can be cut now.
+
+        Args:
+            now: the current time.
+            silent_at: the time at which the player becomes silent.
+        """
         text = self.text
         start = len(text) - len(text[self._position :].lstrip())
         if self._position or not self.ended:
@@ -184,7 +195,10 @@ class GrowingText:
         return _find_gap(text, start, longest) if passed == _LONG_QUIET else None
 
     def _find_sentence_end(self, passed: int) -> int | None:
-        """Return the end of the first sentence after the position, given what has passed since the last change."""
+        """Return the end of the first sentence after the position, if it is known.
+
+        `passed` says how long the text has not changed.
+        """
         for found in _SENTENCE_END.finditer(self.text, max(self._position, self._searched)):
             self._searched = found.start()
             needed = _judge(self.text, self._position, found)
@@ -197,7 +211,10 @@ class GrowingText:
 
 
 def _judge(text: str, start: int, found: re.Match[str]) -> int:
-    """Return what has to pass before the sentence that begins at `start` may end here."""
+    """Return how long to wait before a sentence may end at this stop.
+
+    The sentence begins at `start`.
+    """
     kind, end = found.lastgroup, found.end()
     sentence = text[start:end]
     if not re.search(r"\w", sentence[:_PART_CHARS]):
@@ -218,7 +235,10 @@ def _judge(text: str, start: int, found: re.Match[str]) -> int:
 
 
 def _judge_abbreviation(text: str, following: int, kind: str) -> int:
-    """Return what has to pass before a sentence may end after an abbreviation or a number, given what follows."""
+    """Return how long to wait before a sentence may end after an abbreviation or a number.
+
+    `following` is the offset of the text after it.
+    """
     if kind == "never":
         return _NEVER
     if _LAST_WORD.match(text, following):
@@ -227,7 +247,10 @@ def _judge_abbreviation(text: str, following: int, kind: str) -> int:
 
 
 def _find_gap(text: str, start: int, longest: int) -> int | None:
-    """Return the offset of the last gap between words, or None if the words before it are too short."""
+    """Return the offset of the last gap between words.
+
+    Return None if the words before it are too short.
+    """
     gaps = [each.start() for each in _GAP.finditer(text, start + _CLAUSE_CHARS, longest + 1)]
     return gaps[-1] if gaps else None
 

@@ -352,7 +352,9 @@ class Driver:
         self._proxy.notify("finished-utterance", completed=runner.duration is not None)
 
     def _parts(self, text: str, playback: Playback) -> Iterator[tuple[str, bool]]:
-        """Yield the parts of a text, each as soon as it can be spoken, and whether it is the last part.
+        """Yield the parts of a text as soon as they can be spoken.
+
+        Also yield whether a part is the last one.
 
         A text that doesn't grow is a single part. While text is missing, the playback continues.
         """

@@ -352,11 +352,14 @@ class Playback:
     # -- methods for the driver
 
     def begin_part(self, start: int, *, is_last: bool) -> None:
-        """Continue with another part of the text, which begins at this offset."""
+        """Continue with the part of the text that begins at this offset."""
         self._part_start, self._part_begin, self._part_follows = start, self._samples.end, not is_last
 
     def buffered(self) -> float:
-        """Return how many seconds of sound the player has left. The result is 0 if the sound goes into a file."""
+        """Return how many seconds of sound the player has left.
+
+        The result is 0 if the sound goes into a file.
+        """
         if self._feed is None or not self._feed.player.real_time:
             return 0.0
         unsent = self._seconds(self._sendable_end(self._feed) - self._sent)  # without silence that is held back
@@ -364,7 +367,7 @@ class Playback:
         return max(0.0, self._feed.buffered(time.monotonic()) + unsent - MIN_PLAYER_BUFFER_S)
 
     def await_text(self, until: float) -> None:
-        """Keep playing until more text may have arrived, or until this monotonic time."""
+        """Keep playing until more text may have arrived or time is up."""
         self._text_was_missing = True
         if self._feed is not None:
             self._with_player(lambda feed: self._await_samples(feed, until=until))

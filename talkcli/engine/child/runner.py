@@ -128,7 +128,7 @@ class ActiveGoal:
         self.overdue_logged = False
 
     def append(self, command: protocol.Append, now: float) -> None:
-        """Add text to a text that grows, or end it."""
+        """Add text to a growing text, or end it."""
         assert self.growing_text
         text = self._read(command.text, ended=command.end)
         self.growing_text.append(text, now)
@@ -139,7 +139,10 @@ class ActiveGoal:
             self.growing_text.end()
 
     def _read(self, text: str, *, ended: bool) -> str:
-        """Return what can be spoken of text in Markdown and of earlier text. Return any other text unchanged."""
+        """Return what can be spoken of added text and of earlier text.
+
+        Text that is not Markdown is returned unchanged.
+        """
         return self._markdown.read(text, ended=ended) if self._markdown else text
 
     def speech_seconds(self, now: float) -> float:
@@ -304,11 +307,14 @@ class GoalRunner:
 
     @property
     def growing_text(self) -> GrowingText | None:
-        """The text of the current goal if it may still grow, otherwise None."""
+        """The text of the current goal, or None if it does not grow."""
         return self._goal.growing_text if self._goal else None
 
     def report_text_missing(self, missing: bool) -> None:
-        """Tell the server whether the goal is silent because text is missing, unless the server already knows."""
+        """Tell the server whether the goal is silent because text is missing.
+
+        Do nothing if the server already knows.
+        """
         goal = self._goal
         if goal is not None and missing != goal.text_missing:
             goal.text_missing = missing
@@ -349,7 +355,8 @@ class GoalRunner:
         if self._goal is goal and self._pump is not None and goal.command.lead_in:
             self._fail_goal(Reason.BAD_OPTION, "this driver plays the sound itself, so lead_in can't be used")
         if self._goal is goal and self._pump is not None and goal.growing_text:
-            self._fail_goal(Reason.BAD_OPTION, "this driver can't speak a text that grows; send it when it is complete")
+            words = "this driver can't speak growing texts; send the text when it is complete"
+            self._fail_goal(Reason.BAD_OPTION, words)
         goal.error = None
         while self._goal is goal:
             if goal.with_driver:
@@ -478,7 +485,10 @@ def _markdown_reader() -> MarkdownReader:
 
 
 def _growing_text(beginning: str, command: protocol.Speak) -> GrowingText:
-    """Return the text of a goal that grows, or that has grown and broke off before this process got it."""
+    """Return the text of a growing goal.
+
+    The text may already have broken off.
+    """
     from talkcli.engine.child.cutting import GrowingText  # rarely needed, and slow to import
 
     text = GrowingText(beginning, ended=False)

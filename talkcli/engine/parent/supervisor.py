@@ -406,7 +406,10 @@ class Supervisor:
         return False
 
     def _append_text(self, goal_id: str, text: str, *, end: bool, broken: bool) -> None:
-        """Send the process the new part of the text, and keep the whole text in case the goal must be sent again."""
+        """Send the process the new part of the text.
+
+        Keep the whole text, because the goal may have to be sent again.
+        """
         goal = self._current_goal(goal_id)
         if goal is None:
             return

@@ -324,6 +324,9 @@ def sender_name(user: str, name: str | None = None) -> str:
 
 
 def remote_user(goal: Goal) -> str | None:
-    """Return the user name of the remote client that sent a goal, or None if the sender was a local client."""
+    """Return the name of the user who sent a goal.
+
+    Return None if the sender was a local client.
+    """
     name = (goal.client and goal.client.name) or ""
     return name.removeprefix(topics.REMOTE_PREFIX).split(" ")[0] if name.startswith(topics.REMOTE_PREFIX) else None

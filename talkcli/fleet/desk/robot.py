@@ -201,7 +201,10 @@ class RobotConnection(Connection):
         return self.absent_since + ABSENCE_LIMIT_S, f"{self.absence} (for {ABSENCE_LIMIT_S:g} s)"
 
     def unsupported(self, request: Request) -> TalkError | None:
-        """Return an error if the robot's server is known to lack a feature that a request needs, otherwise None."""
+        """Return an error if the robot's server lacks a feature that a request needs.
+
+        Return None if the server's features are unknown.
+        """
         error = super().unsupported(request)
         return ProtocolMismatch(f"{self.robot}: {error.message}") if error else None
 

@@ -1,4 +1,4 @@
-"""Rows of texts that grow while they are spoken: first sound, additions, silence and memory."""
+"""Rows about growing texts: first sound, additions, silence and memory."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _PATIENCE_S = 120.0
 
 
 def growing(harness: Harness) -> list[Row]:
-    """Measure what is heard of growing texts, beside a text that is sent as a whole, and how long an addition takes."""
+    """Measure growing texts beside a text that is sent as a whole."""
     with contextlib.closing(_Sender(harness.talk.socket)) as sender:
         sounds = {each: partial(_sentence_begins, harness, sender, each) for each in (_NEXT, "")}
         silences = {each: partial(_silence, harness, sender, more=each == "growing") for each in ("growing", "whole")}
@@ -48,7 +48,7 @@ def growing(harness: Harness) -> list[Row]:
 
 
 class _Sender(Wire):
-    """A connection that sends growing texts, and knows how long each reply to an addition took."""
+    """A connection that sends growing texts, and times the replies to additions."""
 
     def __init__(self, path: str) -> None:
         super().__init__(path)
@@ -58,9 +58,9 @@ class _Sender(Wire):
         return str(self.request("say", text=text, more=more, wait=True)["goal"]["id"])
 
     def append(self, goal: str, text: str = "", **fields: bool) -> None:
-        began = time.monotonic()
+        started_at = time.monotonic()
         reply = self.request("append", timeout=_PATIENCE_S, id=goal, text=text, **fields)
-        self.seconds.append(time.monotonic() - began)
+        self.seconds.append(time.monotonic() - started_at)
         assert reply["ok"], reply
 
     def finish(self, goal: str, wanted: str = "SUCCEEDED") -> None:
@@ -101,7 +101,7 @@ def _silence(harness: Harness, sender: _Sender, *, more: bool) -> float:
 
 
 def _memory() -> float:
-    """Return by how many megabytes a server and its engine grow through the longest text."""
+    """Return how many megabytes more a server and its engine use after the longest text."""
     with contextlib.ExitStack() as stack:
         file = f"file:{stack.enter_context(short_directory())}/spoken.wav"
         talk = stack.enter_context(serving("--player", file, "--rate", "450"))
