@@ -76,7 +76,7 @@ def test_invalid_bytes_are_reported_once(talk: Talk) -> None:
         time.sleep(0.05)
     _, err = client.communicate(timeout=20)
     assert client.returncode == 0
-    assert err == "talk: line 2, column 1: the byte 0xff is not valid UTF-8, so it is not spoken (1 more like it)\n"
+    assert err == "talk: line 2, column 1: the byte 0xff is not valid UTF-8 and is skipped (1 more like it)\n"
     assert talk.goal(talk.watcher.goals()[0])["text"] == "One ä\n\ufffd two \ufffd\ufffd"
 
 
