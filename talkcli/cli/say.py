@@ -130,9 +130,8 @@ def _wait_for_goal(
 ) -> int:
     """Wait until a goal has ended, report it, and return the exit code.
 
-    Cancel it on an interrupt or timeout.
-
-    If an earlier command has already sent a goal with the same id, that goal isn't cancelled.
+    Cancel it on an interrupt or timeout. If an earlier command has already sent a goal with the same id, that goal
+    isn't cancelled.
 
     Raises:
         TimedOut: the goal hasn't succeeded in time.

@@ -49,10 +49,9 @@ _LONG_SEQ = 10**15
 class Client:
     """A connection to a talk server.
 
-    The client looks for the server in the same places as the command `talk`.
-
-    If the connection breaks, for example because the server was restarted, the next call reconnects. If the server is
-    still the same process, its goals are followed again. Otherwise they are LOST.
+    The client looks for the server in the same places as the command `talk`. If the connection breaks, for example
+    because the server was restarted, the next call reconnects. If the server is still the same process, its goals are
+    followed again. Otherwise they are LOST.
 
     While there is no server, calls raise ServerUnavailable at once. There is a pause of 0.1 s between two attempts to
     reconnect, which only a cancel ignores.
@@ -238,9 +237,7 @@ class Client:
     ) -> Canceled:
         """Cancel goals, and return them once they are silent.
 
-        Without arguments, cancel all goals.
-
-        A goal is cancelled if any of the arguments selects it.
+        Without arguments, cancel all goals. A goal is cancelled if any of the arguments selects it.
 
         Args:
             ids: select the goals with these ids. An empty list selects no goal.

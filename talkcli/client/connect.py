@@ -111,9 +111,7 @@ def send_early(
 ) -> ConnectionAttempt | None:
     """Send hello, and the first request if the greeting arrives soon.
 
-    Return the new state, or None if disconnected.
-
-    The request is not sent if the greeting is late or unexpected.
+    Return the new state, or None if disconnected. The request is not sent if the greeting is late or unexpected.
 
     Args:
         attempt: an open connection.
@@ -148,12 +146,10 @@ def send_early(
 def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> None:
     """Sleep for a moment, so that the server can use the processor.
 
-    Return early if the goal will not be spoken.
-
-    A client that only waits for the end of its goal calls this before its other imports. The server, the engine, the
-    player and the sound server need the processor until the first sound. Together they use about as much processor time
-    as this process has used so far, on any machine. On two busy cores, the first sound took 1.4 times as long if the
-    client went on importing.
+    Return early if the goal will not be spoken. A client that only waits for the end of its goal calls this before its
+    other imports. The server, the engine, the player and the sound server need the processor until the first sound.
+    Together they use about as much processor time as this process has used so far, on any machine. On two busy cores,
+    the first sound took 1.4 times as long if the client went on importing.
 
     Args:
         attempt: a connection on which a request was sent. Received bytes can still be read afterwards.

@@ -54,10 +54,9 @@ def checked_sender_name(name: str | None) -> str | None:
 def take_repeatedly(connection: Connection, take: Callable[[], _T], end: float | None) -> Iterator[_T]:
     """Call `take` repeatedly, and yield its results.
 
-    While there is no result, wait for the server.
-
-    An empty result is yielded if `end` has passed or the connection has ended. Nothing more is received after `end`, so
-    that a loop over the results ends even if the server keeps sending events.
+    While there is no result, wait for the server. An empty result is yielded if `end` has passed or the connection has
+    ended. Nothing more is received after `end`, so that a loop over the results ends even if the server keeps sending
+    events.
 
     Args:
         connection: the connection to wait for.
@@ -178,9 +177,8 @@ class Connection(ClientCore):
     def submit(self, request: Request, on_reply: OnReply, on_failure: OnFailure) -> None:
         """Send a request without blocking.
 
-        Later calls send the bytes that the server doesn't accept now.
-
-        One of the two functions is called during this call or a later one, while the lock `changed` is held.
+        Later calls send the bytes that the server doesn't accept now. One of the two functions is called during this
+        call or a later one, while the lock `changed` is held.
 
         Args:
             request: the request.
@@ -206,9 +204,8 @@ class Connection(ClientCore):
     ) -> bool:
         """Process messages until `done()` is true.
 
-        Return False if the deadline passes or the connection ends first.
-
-        If the server is silent for too long, the connection ends.
+        Return False if the deadline passes or the connection ends first. If the server is silent for too long, the
+        connection ends.
 
         Args:
             done: called while the lock `changed` is held, and never again after it has returned True.
@@ -515,9 +512,8 @@ class ReconnectingConnection(SocketConnection):
     def _give_up_socket(self) -> None:
         """Disconnect.
 
-        If a thread is reading, that thread closes the socket, because it may still be polling it.
-
-        The caller must hold the lock `changed`.
+        If a thread is reading, that thread closes the socket, because it may still be polling it. The caller must hold
+        the lock `changed`.
         """
         self._hang_up()
         if not self._reading:

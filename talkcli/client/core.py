@@ -73,9 +73,8 @@ class EventBuffer:
     def add(self, event: Event) -> None:
         """Add an event unless it is a duplicate.
 
-        Close the buffer if too many state changes are unread.
-
-        A connection that waits for a goal and also watches all goals receives each state twice.
+        Close the buffer if too many state changes are unread. A connection that waits for a goal and also watches all
+        goals receives each state twice.
         """
         number = getattr(event, "n", None)
         if number is not None and number == self._last_number:
@@ -665,9 +664,8 @@ class ClientCore:
     def connected(self, boot: str, pid: int | None, now: float) -> None:
         """Record the greeting on a new connection.
 
-        Follow all goals again, or end them as LOST.
-
-        Goals are followed again if the server wasn't restarted in the meantime. Otherwise they are LOST.
+        Follow all goals again, or end them as LOST. Goals are followed again if the server wasn't restarted in the
+        meantime. Otherwise they are LOST.
 
         Args:
             boot: the boot id in the greeting. Each start of the server has another one.

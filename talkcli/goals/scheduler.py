@@ -264,9 +264,7 @@ class Scheduler:
     def change_settings(self, changes: dict[str, object], now: Now) -> list[Effect]:
         """Change the settings for goals that have not started.
 
-        Return the effects.
-
-        A new voice that failed to load earlier is loaded again.
+        Return the effects. A new voice that failed to load earlier is loaded again.
         """
         self.settings = replace(self.settings, **changes)
         voice = changes.get("voice")
@@ -397,10 +395,8 @@ class Scheduler:
     def failed(self, goal_id: str, reason: Reason, message: str, duration: float | None, now: Now) -> list[Effect]:
         """End the active goal as ABORTED, or as PREEMPTED if it was being stopped.
 
-        Return the effects.
-
-        If the goal was being stopped, the failure has silenced it, so it ends PREEMPTED. It ends ABORTED only with the
-        reason `not_silent`.
+        Return the effects. If the goal was being stopped, the failure has silenced it, so it ends PREEMPTED. It ends
+        ABORTED only with the reason `not_silent`.
         """
         record = self._require_active(goal_id)
         record.duration = duration
@@ -525,8 +521,6 @@ class Scheduler:
     def _throttle(self, say: Say, record: Record, now: Now) -> Refusal | None:
         """Return a refusal if a goal repeats another one too soon.
 
-        May set `record.by`.
-
         If the goal is rejected, `record.by` is set to the other goal.
         """
         if say.throttle is None:
@@ -604,10 +598,8 @@ class Scheduler:
     def _order_next_voice(self, now: Now) -> list[Effect]:
         """Choose the next voice to load, and mark it as loading.
 
-        Return a list with the order, if any.
-
-        The first voice is not loaded while a goal is active. Loading it imports libraries, which blocks the engine
-        process for a tenth of a second.
+        Return a list with the order, if any. The first voice is not loaded while a goal is active. Loading it imports
+        libraries, which blocks the engine process for a tenth of a second.
         """
         if not (self._loads_voices and self.voices.can_load) or self.closing:
             return []
@@ -672,9 +664,8 @@ class Scheduler:
     def _activate_next(self, now: Now) -> tuple[Record | None, list[Effect]]:
         """Make the next goal ACTIVE if possible.
 
-        Return it, and the effects without the order to speak it.
-
-        Return None instead of a goal if no goal can start now.
+        Return it, and the effects without the order to speak it. Return None instead of a goal if no goal can start
+        now.
         """
         if self.active or self.paused:
             return None, []

@@ -199,9 +199,8 @@ class VoiceScheduler:
     def drop_excess(self, first: str, needed: Sequence[str]) -> list[VoiceDropOrder | VoiceWarning]:
         """Choose the voices to drop to meet the memory limit.
 
-        Return the orders to drop them, and any warnings.
-
-        This is necessary if the voices use more memory than was estimated.
+        Return the orders to drop them, and any warnings. This is necessary if the voices use more memory than was
+        estimated.
 
         Args:
             first: the voice that speaks now or next. It is never dropped.

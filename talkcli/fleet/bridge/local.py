@@ -102,9 +102,8 @@ class LocalConnection(ClientCore):
     def close(self) -> None:
         """Close the connection.
 
-        A waiting `read` must first be canceled, or ended with `abort`.
-
-        The server cancels the requests that it has not answered, if possible.
+        A waiting `read` must first be canceled, or ended with `abort`. The server cancels the requests that it has not
+        answered, if possible.
         """
         if self._socket.fileno() >= 0:
             self._loop.remove_reader(self._socket)
