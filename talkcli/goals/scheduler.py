@@ -204,7 +204,7 @@ class Scheduler:
         ttl = (self.settings.ttl if say.ttl is None else say.ttl) or None
         expires_at = inf if ttl is None else now.monotonic + ttl - waited_s
         number, asked = self._count, say if ttl == say.ttl else replace(say, ttl=ttl)
-        record = Record(f"{self.boot}-{number}", number, asked, sender, now.wall, self._preempts(say), expires_at)
+        record = Record(f"{self.boot}-{number}", number, asked, sender, now.wall, self._may_preempt(say), expires_at)
         by = canceled or self._early_cancels.find(say.id, now.monotonic)
         refused = self._find_refusal(say, refusal, first) or (None if canceled else self._throttle(say, record, now))
         expired = expires_at <= now.monotonic
@@ -540,8 +540,8 @@ class Scheduler:
         what = "the same text" if say.key is None else "a goal with this key"
         return Reason.THROTTLED, f"{what} {words}"
 
-    def _preempts(self, say: Say) -> bool:
-        """Return whether a goal interrupts others."""
+    def _may_preempt(self, say: Say) -> bool:
+        """Return whether a goal asks to interrupt others, itself or by the server's setting."""
         return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)
 
     def _find_room(self, say: Say) -> list[tuple[Record, Reason]] | None:
@@ -550,7 +550,7 @@ class Scheduler:
         preempted: list[Record] = []
         if say.flush:
             preempted = self.pending.goals_up_to(say.priority)
-        elif self._preempts(say):
+        elif self._may_preempt(say):
             preempted = self.pending.preempting_goals_up_to(say.priority)
         recalled = [(replaced, Reason.REPLACED)] if replaced else []
         recalled += [(each, Reason.PREEMPTED) for each in preempted if each is not replaced]

@@ -286,7 +286,7 @@ class Playback:
     # -- methods for the synthesizer
 
     def begin(self, rate: int, voice: str, fallback_reason: str | None = None) -> None:
-        """Set the sample rate, and start a player unless the goal is paused.
+        """Set the sample rate, report the voice, and start a player if it plays in real time and may play now.
 
         The player starts in 1 to 15 ms, while the synthesizer produces the first samples. `write` raises its errors.
 

@@ -85,10 +85,7 @@ class LocalConnection(ClientCore):
         return lines
 
     def send(self, exchange: Exchange) -> bool:
-        """Send the request of an exchange, which will receive the answer.
-
-        Return False if the request is too long.
-        """
+        """Send an exchange's request, or return False if the request is too long."""
         self.register(exchange, self._loop.time())
         line = self.line(exchange)
         if len(line) > MAX_LINE_BYTES:

@@ -224,7 +224,7 @@ class ModelLoader:
         self._start_next_load()
 
     def _measure_memory(self, voice: str, min_growth: float = -math.inf) -> None:
-        """Record an event about the growth of the process's memory.
+        """Record an event with the memory that all voices use, and the voice because of which it is measured.
 
         If the growth since the last event is below `min_growth` bytes, record nothing unless a voice was unloaded.
         """
