@@ -207,6 +207,8 @@ class Client:
     def follow(self, ids: Iterable[str] | None = None, *, feedback: bool = False) -> list[GoalHandle]:
         """Receive the events of goals, and return their handles.
 
+        Any client may have sent the goals.
+
         Args:
             ids: ids of goals; None for all goals that have not ended.
             feedback: also receive each word of these goals as it is heard.
@@ -348,14 +350,15 @@ class Client:
     def pause(self) -> Goal | None:
         """Pause all speech, and return the paused goal, if any, once it is silent.
 
-        Nothing is spoken until any client calls `resume`. Pausing twice is no error.
+        Return None if no goal was being spoken. Nothing is spoken until any client calls `resume`. Pausing twice is no
+        error.
         """
         return goal_in(self._connection.request(Pause())[0])
 
     def resume(self) -> Goal | None:
         """Resume speech, and return the resumed goal, if any.
 
-        Resuming twice is no error.
+        Return None if no goal was paused. Resuming twice is no error.
         """
         return goal_in(self._connection.request(Resume())[0])
 
@@ -428,7 +431,12 @@ class Client:
 
 
 def check_id(goal_id: str) -> None:
-    """Raise an error if no goal can have this id."""
+    """Raise an error if no goal can have this id.
+
+    Raises:
+        UsageError: the id is empty.
+        UnknownGoal: the id is too long for any goal.
+    """
     if not goal_id:
         raise UsageError("the goal's id is empty; check the variable that should contain it")
     if len(goal_id) > MAX_ID_CHARS:

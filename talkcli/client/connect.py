@@ -170,7 +170,10 @@ def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> None:
 
 
 def sender_name(name: str | None) -> str | None:
-    """Return the given name, or else the value of TALK_NAME."""
+    """Return the given name, or else the value of TALK_NAME.
+
+    Return None if neither is set.
+    """
     # Cancelling must work even if the variable is not valid UTF-8.
     variable = os.environ.get("TALK_NAME", "").encode(errors="surrogateescape").decode(errors="replace")
     return name or variable or None

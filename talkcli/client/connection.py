@@ -43,7 +43,7 @@ _RECONNECT_PAUSE_S = 0.1
 def checked_sender_name(name: str | None) -> str | None:
     """Return the given name, or else the value of TALK_NAME.
 
-    Raises UsageError if the name is too long.
+    Return None if neither is set. Raises UsageError if the name is too long.
     """
     name = sender_name(name)
     if name and len(name) > MAX_SENDER_NAME_CHARS:
@@ -316,6 +316,8 @@ class SocketConnection(Connection):
         end: float | None = None,
     ) -> None:
         """Connect to a server.
+
+        The errors are those of `Client`.
 
         Args:
             socket: path of the server's socket. The default is TALK_SOCKET, or else the usual places.

@@ -118,7 +118,7 @@ class Fleet:
         return self._send_request(to, Cancel(None if ids is None else tuple(ids), current, before, key))
 
     def wait(self, to: str, ids: Iterable[str] | None = None) -> FleetRequest:
-        """Wait for goals on each robot, by default all current ones.
+        """Wait for goals on each robot to end, by default all current ones.
 
         Return the request, which yields the outcomes.
         """

@@ -58,7 +58,10 @@ _MAX_FLOAT = 1.7976931348623157e308
 
 
 def without_speaker(voice: str | None) -> str:
-    """Return the id of a voice without its speaker."""
+    """Return the id of a voice without its speaker.
+
+    Return an empty string if the voice is None.
+    """
     return (voice or "").partition(SPEAKER_MARK)[0]
 
 
@@ -595,7 +598,8 @@ class Cancel:
     def select_waiting(self, goals: Sequence[Say]) -> list[int]:
         """Return the indexes of the waiting goals that the request cancels.
 
-        Such goals have an id only if their sender chose one, so `before` selects them only if it names such an id.
+        All these goals wait for room in the queue. They have an id only if their sender chose one, so `before` selects
+        them only if it names such an id.
         """
         ids = set(self.ids or ())
         last = max((index for index, say in enumerate(goals) if say.id == self.before is not None), default=-1)

@@ -144,7 +144,10 @@ class Scheduler:
         return ([self.active] if self.active else []) + list(self.pending)
 
     def find(self, goal_id: str) -> Record | None:
-        """Return the goal with this id, or None if it is unknown."""
+        """Return the goal with this id, or None if it is unknown.
+
+        Goals that ended long ago are forgotten.
+        """
         return self._by_id.get(goal_id) or self.history.find(goal_id)
 
     def has_room(self, say: Say) -> bool:
@@ -183,7 +186,7 @@ class Scheduler:
     ) -> tuple[Record, list[Effect]]:
         """Reject a goal or add it to the queue.
 
-        Return its record, and the effects to carry out.
+        Return its record, and the effects to carry out. A rejected goal doesn't affect other goals.
 
         Args:
             say: the goal.
@@ -236,7 +239,7 @@ class Scheduler:
     ) -> Cancellation:
         """Cancel the selected goals, and remember cancels for unknown ids.
 
-        The result contains the effects.
+        Pending goals end at once. The active goal ends when the engine is silent. The result contains the effects.
 
         Args:
             selection: the goals to cancel.
@@ -274,7 +277,10 @@ class Scheduler:
         return self.tick(now)  # the next goal may not have to wait for its voice any more
 
     def pause(self) -> list[Effect]:
-        """Pause the active goal, and prevent others from starting."""
+        """Pause the active goal, and prevent others from starting.
+
+        The pause lasts until `resume` is called.
+        """
         if self.paused:
             return []
         self.paused = True
@@ -312,13 +318,16 @@ class Scheduler:
     def engine_lost(self, now: Now) -> list[Effect]:
         """Record that the engine process has exited.
 
-        Return warnings about voices.
+        No goal starts until a new engine is ready. Return warnings about voices.
         """
         self.has_engine = self._loads_voices = False
         return [*self.voices.engine_lost(now.monotonic)]
 
     def engine_ready(self, now: Now) -> list[Effect]:
-        """Record that an engine is ready, and start the next goal."""
+        """Record that an engine is ready, and start the next goal.
+
+        Return the effects, which also load the voices that goals need.
+        """
         self.has_engine = self._loads_voices = True
         for voice in (*self._needed_voices(), self.settings.voice or ""):
             self._request_voice(voice, now)
@@ -327,7 +336,7 @@ class Scheduler:
     def engine_unavailable(self, now: Now) -> list[Effect]:
         """Record that no engine can be started.
 
-        Return the effects.
+        From now on, goals fail at once instead of waiting. Return the effects.
         """
         self.has_engine, self._loads_voices = True, False
         return self._start_next(now)
@@ -363,7 +372,10 @@ class Scheduler:
         return self._order_next_voice(now)
 
     def output_changed(self, goal_id: str, output: Output | None) -> None:
-        """Record the audio output of the active goal."""
+        """Record the audio output of the active goal.
+
+        `output` is None if it is unknown.
+        """
         self._require_active(goal_id).output = output
 
     def completed(
@@ -451,7 +463,10 @@ class Scheduler:
     # -- time limits
 
     def deadline(self) -> float:
-        """Return the monotonic time at which `tick` must be called next."""
+        """Return the monotonic time at which `tick` must be called next.
+
+        Return inf if there is no time limit.
+        """
         return min(self._active_deadline(), self.pending.next_expiry(), self._next_deadline())
 
     def tick(self, now: Now) -> list[Effect]:

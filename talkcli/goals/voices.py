@@ -170,8 +170,8 @@ class VoiceScheduler:
     def load_next(self, needed: Sequence[str], default_voice: str, now: float) -> VoiceLoadOrder | None:
         """Choose the next voice to load, and return the order.
 
-        Call this only if `can_load` is true. A loaded voice is not dropped if a goal needs it sooner than the next
-        voice, because it would have to be loaded again.
+        Return None if no voice can be loaded now. Call this only if `can_load` is true. A loaded voice is not dropped
+        if a goal needs it sooner than the next voice, because it would have to be loaded again.
 
         Args:
             needed: the voices that waiting goals need, in the order of the goals.
