@@ -357,8 +357,8 @@ OPTIONS = (
         # The range is not in `limits`, because the help text would then show it.
         check=_check_priority,
         form=f"{-MAX_PRIORITY:,} to {MAX_PRIORITY:,}",
-        help="Set the priority. Sentences with a higher priority are spoken first, and this sentence never "
-        "interrupts them.",
+        help="Set the priority. Sentences with a higher priority are spoken first. This sentence never interrupts or "
+        "flushes them.",
         in_goal=True,
     ),
     Option(
@@ -394,7 +394,7 @@ OPTIONS = (
         "reject the goal if the same text is waiting, is being spoken, or started less than this many seconds ago. For "
         "a goal with a key, keys are compared instead of texts, and waiting goals are ignored",
         limits=(0, None),
-        help="Skip the sentence if it was spoken in the last SEC seconds. With --key, all sentences with it count.",
+        help="Skip the sentence if it was spoken in the last SEC seconds. With --key, sentences with this KEY count.",
     ),
     Option(
         "id",
@@ -438,7 +438,7 @@ OPTIONS = (
         setting=Setting(
             None,
             none_value=DEFAULT_VOICE,
-            set_help="Use this voice. It is an id, name or language from 'talk voices', or 'default'.",
+            set_help="Use this voice: an id, name or language from 'talk voices'. 'default' is the engine's own.",
             words="voice {}",
             none_words="default voice",
         ),
