@@ -47,7 +47,7 @@ PLACE_STOPPED = "a stopped process is listening"
 #: Advice if the server refuses the client, by error code.
 _REFUSAL_ADVICE = {
     "protocol_mismatch": "install the same version of talk for the server and its clients, and restart the server",
-    "busy": "end some clients, or raise the limit named above: talk serve --max-clients 512, or LimitNOFILE=",
+    "busy": "end some clients, or raise the limit in the message: talk serve --max-clients 512, or LimitNOFILE=",
     "permission_denied": "ask its owner for access: talk serve --socket-mode 0660, and join the socket's group",
 }
 #: Advice for each kind of place. If several kinds were found, the first one in this table counts.

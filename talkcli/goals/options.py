@@ -335,7 +335,7 @@ OPTIONS = (
         setting=Setting(
             False,
             meaning="whether goals that were sent without `preempt` interrupt the current goal",
-            set_help="Choose whether new sentences interrupt the current one. Otherwise, they wait in the queue.",
+            set_help="Choose whether new sentences interrupt the current one. 'talk say --queue' always waits.",
             serve_help="Let new sentences interrupt the current sentence. 'talk say --queue' always waits.",
             flags="--preempt/--no-preempt",
             words="new goals interrupt",
