@@ -122,7 +122,10 @@ class Busy(RequestRefused):
 
 
 class BadOption(RequestRefused):
-    """The server refused the value of a setting."""
+    """The server refused the value of a setting.
+
+    The value is out of range, or the voice doesn't exist.
+    """
 
     code = "bad_option"
     exit_code = EXIT_USAGE

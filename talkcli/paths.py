@@ -36,9 +36,8 @@ def named_socket(option: str | None) -> str | None:
 def named_robot(option: str | None, socket: str | None) -> str | None:
     """Return the robot named by --robot or by TALK_ROBOT, if any.
 
-    TALK_ROBOT is ignored if --socket is given.
-
-    Both options take precedence over the variables, and TALK_ROBOT over TALK_SOCKET.
+    TALK_ROBOT is ignored if --socket is given. Both options take precedence over the variables, and TALK_ROBOT over
+    TALK_SOCKET.
     """
     return option or (None if socket else os.environ.get("TALK_ROBOT") or None)
 

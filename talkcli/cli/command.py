@@ -163,13 +163,13 @@ COMMON_OPTIONS = (
     option(
         "--socket",
         PATH,
-        "Set the path of the server's socket.  [env var: TALK_SOCKET; default: search the usual places]",
+        "Set the path of the server's socket.  [env var: TALK_SOCKET; default: the usual places, see 'talk doctor']",
         completion="files",
     ),
     option(
         "--robot",
         WORD,
-        "Send the command to this robot through TALK_BROKER. A pattern, @GROUP or @all selects several robots.  "
+        "Use this robot through the broker TALK_BROKER. A pattern, @GROUP or @all selects several robots.  "
         "[env var: TALK_ROBOT]",
         metavar="NAME",
         completion="robots",

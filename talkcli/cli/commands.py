@@ -199,8 +199,8 @@ _ROWS = (
         Speak TEXT. If TEXT is '-', speak standard input as one sentence.
 
         The command prints the goal's id, and returns as soon as the server has accepted the goal. With --wait, the
-        command returns when the goal has ended. If the command is interrupted before that, for example by Ctrl-C,
-        SIGTERM, SIGHUP or a lost ssh connection, it cancels the goal.
+        command returns when the goal has ended. Before that, the command cancels the goal on Ctrl-C, SIGTERM or
+        SIGHUP, or if its output is closed, for example when ssh disconnects.
 
         With --lines, the exit code is the result of the first line that failed, and --ttl counts from the moment when
         a line is read.
@@ -379,8 +379,8 @@ _ROWS = (
         List the id, language and name of each voice. The option --voice accepts an id, a name, a locale such as de_DE,
         or a language such as de or german.
 
-        A variant such as f3 can be added to an id: en-us+f3. Neural voices are listed last, and have no variants. Any
-        unambiguous part of a neural voice's id selects the voice: joe for piper/en_US-joe-medium. NAME#3 selects a
+        A variant such as f3 can be added to any of these: en-us+f3. Neural voices are listed last and have no variants.
+        Any unambiguous part of a neural voice's id selects the voice: joe for piper/en_US-joe-medium. NAME#3 selects a
         speaker by number or name. If the server uses a neural voice, the language of this voice also selects it.
         """,
         examples="""
@@ -403,7 +403,7 @@ _ROWS = (
         Each check prints one line: ok, warning or failed. The last check sends a sentence to the server, and waits at
         most 20 seconds for it. If no server is running, the command starts an engine with TALK_PLAYER and TALK_VOICE.
 
-        With --silent, the command always starts its own engine, which plays silence through the server's player. No
+        With --silent, the command starts its own engine, which plays silence through the server's player. No
         goal is delayed, and nothing is logged.
 
         With --robot, the command checks the connection to a robot of a fleet: broker, certificate, login, permissions,

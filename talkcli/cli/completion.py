@@ -201,9 +201,8 @@ def unfinished_keys(options: CommonOptions, _: str) -> Offers:
 def voices(options: CommonOptions, incomplete: str) -> Offers:
     """Return the languages of the voices as completions.
 
-    If no language matches, return voice ids or names.
-
-    Neural voices are always offered by id, because there are few of them and users select them by id.
+    If no language matches, return voice ids or names. Neural voices are always offered by id, because there are few of
+    them and users select them by id.
     """
     with options.connect(COMPLETION_TIMEOUT_S) as client:
         found = client.voices()

@@ -105,9 +105,8 @@ class Interrupts:
     def record(self, error: Interrupted | OSError) -> None:
         """Record whether the output's reader is gone.
 
-        If it is, discard all output. Re-raise unrelated errors.
-
-        The unrelated errors are those other than an interrupt, a timeout or a missing reader.
+        If it is, discard all output. Re-raise unrelated errors. The unrelated errors are those other than an interrupt,
+        a timeout or a missing reader.
         """
         if isinstance(error, Interrupted | TimeoutError):
             self.reader_gone = STDOUT_FD in self.watched and not has_reader()

@@ -106,9 +106,8 @@ def _send_request(
 ) -> int:
     """Send a request to the robots, and print the outcomes.
 
-    Cancel its goals if interrupted.
-
-    Goals are only cancelled if the command waits for goals that it has sent itself. A timeout also interrupts the wait.
+    Cancel its goals if interrupted. Goals are only cancelled if the command waits for goals that it has sent itself. A
+    timeout also interrupts the wait.
 
     Args:
         options: the options of every command.

@@ -74,8 +74,6 @@ class CommonOptions:
     def connect(self, timeout: float | None = None, **options: Any) -> Client:
         """Return a client connected to the server or the robot.
 
-        Retry as long as --connect-timeout allows.
-
         The first call keeps trying for `connect_timeout` seconds.
 
         Args:
@@ -184,9 +182,7 @@ def reader_is_gone(error: OSError) -> bool:
 def handle_output_error(error: Exception) -> int | None:
     """Discard further output after an output error, and return its exit code.
 
-    Return None for other errors.
-
-    A full or broken disk is reported.
+    Return None for other errors. A full or broken disk is reported.
 
     Returns:
         The exit code, or None if the error doesn't concern standard output.

@@ -94,9 +94,8 @@ class GoalReporter:
     def report(self, goal: Goal, prefix: str = "") -> int:
         """With --json, print a goal.
 
-        If it failed, print why. Return its exit code, or 124 if it is unfinished.
-
-        `prefix` is put in front of any message.
+        If it failed, print why. Return its exit code, or 124 if it is unfinished. `prefix` is put in front of any
+        message.
         """
         if self._options.json and not self.feedback.shows_events:
             show_if_possible(show_json, goal.to_json())

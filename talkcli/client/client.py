@@ -50,10 +50,9 @@ _LONG_SEQ = 10**15
 class Client:
     """A connection to a talk server.
 
-    The client looks for the server in the same places as the command `talk`.
-
-    If the connection breaks, for example because the server was restarted, the next call reconnects. If the server is
-    still the same process, its goals are followed again. Otherwise they are LOST.
+    The client looks for the server in the same places as the command `talk`. If the connection breaks, for example
+    because the server was restarted, the next call reconnects. If the server is still the same process, its goals are
+    followed again. Otherwise they are LOST.
 
     While there is no server, calls raise ServerUnavailable at once. There is a pause of 0.1 s between two attempts to
     reconnect, which only a cancel ignores.
@@ -247,6 +246,8 @@ class Client:
     def follow(self, ids: Iterable[str] | None = None, *, feedback: bool = False) -> list[GoalHandle]:
         """Receive the events of goals, and return their handles.
 
+        Any client may have sent the goals.
+
         Args:
             ids: ids of goals; None for all goals that have not ended.
             feedback: also receive each word of these goals as it is heard.
@@ -277,9 +278,7 @@ class Client:
     ) -> Canceled:
         """Cancel goals, and return them once they are silent.
 
-        Without arguments, cancel all goals.
-
-        A goal is cancelled if any of the arguments selects it.
+        Without arguments, cancel all goals. A goal is cancelled if any of the arguments selects it.
 
         Args:
             ids: select the goals with these ids. An empty list selects no goal.
@@ -390,14 +389,15 @@ class Client:
     def pause(self) -> Goal | None:
         """Pause all speech, and return the paused goal, if any, once it is silent.
 
-        Nothing is spoken until any client calls `resume`. Pausing twice is no error.
+        Return None if no goal was being spoken. Nothing is spoken until any client calls `resume`. Pausing twice is no
+        error.
         """
         return goal_in(self._connection.request(Pause())[0])
 
     def resume(self) -> Goal | None:
         """Resume speech, and return the resumed goal, if any.
 
-        Resuming twice is no error.
+        Return None if no goal was paused. Resuming twice is no error.
         """
         return goal_in(self._connection.request(Resume())[0])
 
@@ -475,7 +475,12 @@ def _new_goal_id() -> str:
 
 
 def check_id(goal_id: str) -> None:
-    """Raise an error if no goal can have this id."""
+    """Raise an error if no goal can have this id.
+
+    Raises:
+        UsageError: the id is empty.
+        UnknownGoal: the id is too long for any goal.
+    """
     if not goal_id:
         raise UsageError("the goal's id is empty; check the variable that should contain it")
     if len(goal_id) > MAX_ID_CHARS:

@@ -110,9 +110,8 @@ def send_early(
 ) -> ConnectionAttempt | None:
     """Send hello, and the first request if the greeting arrives soon.
 
-    Return the new state, or None if disconnected.
-
-    The request is not sent if the greeting is late or unexpected, or if the server may lack a feature.
+    Return the new state, or None if disconnected. The request is not sent if the greeting is late or unexpected, or if
+    the server may lack a feature.
 
     Args:
         attempt: an open connection.
@@ -149,12 +148,10 @@ def send_early(
 def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> None:
     """Sleep for a moment, so that the server can use the processor.
 
-    Return early if the goal will not be spoken.
-
-    A client that only waits for the end of its goal calls this before its other imports. The server, the engine, the
-    player and the sound server need the processor until the first sound. Together they use about as much processor time
-    as this process has used so far, on any machine. On two busy cores, the first sound took 1.4 times as long if the
-    client went on importing.
+    Return early if the goal will not be spoken. A client that only waits for the end of its goal calls this before its
+    other imports. The server, the engine, the player and the sound server need the processor until the first sound.
+    Together they use about as much processor time as this process has used so far, on any machine. On two busy cores,
+    the first sound took 1.4 times as long if the client went on importing.
 
     Args:
         attempt: a connection on which a request was sent. Received bytes can still be read afterwards.
@@ -175,7 +172,10 @@ def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> None:
 
 
 def sender_name(name: str | None) -> str | None:
-    """Return the given name, or else the value of TALK_NAME."""
+    """Return the given name, or else the value of TALK_NAME.
+
+    Return None if neither is set.
+    """
     # Cancelling must work even if the variable is not valid UTF-8.
     variable = os.environ.get("TALK_NAME", "").encode(errors="surrogateescape").decode(errors="replace")
     return name or variable or None

@@ -43,7 +43,7 @@ _RECONNECT_PAUSE_S = 0.1
 def checked_sender_name(name: str | None) -> str | None:
     """Return the given name, or else the value of TALK_NAME.
 
-    Raises UsageError if the name is too long.
+    Return None if neither is set. Raises UsageError if the name is too long.
     """
     name = sender_name(name)
     if name and len(name) > MAX_SENDER_NAME_CHARS:
@@ -54,10 +54,9 @@ def checked_sender_name(name: str | None) -> str | None:
 def take_repeatedly(connection: Connection, take: Callable[[], _T], end: float | None) -> Iterator[_T]:
     """Call `take` repeatedly, and yield its results.
 
-    While there is no result, wait for the server.
-
-    An empty result is yielded if `end` has passed or the connection has ended. Nothing more is received after `end`, so
-    that a loop over the results ends even if the server keeps sending events.
+    While there is no result, wait for the server. An empty result is yielded if `end` has passed or the connection has
+    ended. Nothing more is received after `end`, so that a loop over the results ends even if the server keeps sending
+    events.
 
     Args:
         connection: the connection to wait for.
@@ -180,9 +179,8 @@ class Connection(ClientCore):
     def submit(self, request: Request, on_reply: OnReply, on_failure: OnFailure) -> None:
         """Send a request without blocking.
 
-        Later calls send the bytes that the server doesn't accept now.
-
-        One of the two functions is called during this call or a later one, while the lock `changed` is held.
+        Later calls send the bytes that the server doesn't accept now. One of the two functions is called during this
+        call or a later one, while the lock `changed` is held.
 
         Args:
             request: the request.
@@ -208,9 +206,8 @@ class Connection(ClientCore):
     ) -> bool:
         """Process messages until `done()` is true.
 
-        Return False if the deadline passes or the connection ends first.
-
-        If the server is silent for too long, the connection ends.
+        Return False if the deadline passes or the connection ends first. If the server is silent for too long, the
+        connection ends.
 
         Args:
             done: called while the lock `changed` is held, and never again after it has returned True.
@@ -321,6 +318,8 @@ class SocketConnection(Connection):
         end: float | None = None,
     ) -> None:
         """Connect to a server.
+
+        The errors are those of `Client`.
 
         Args:
             socket: path of the server's socket. The default is TALK_SOCKET, or else the usual places.
@@ -518,9 +517,8 @@ class ReconnectingConnection(SocketConnection):
     def _give_up_socket(self) -> None:
         """Disconnect.
 
-        If a thread is reading, that thread closes the socket, because it may still be polling it.
-
-        The caller must hold the lock `changed`.
+        If a thread is reading, that thread closes the socket, because it may still be polling it. The caller must hold
+        the lock `changed`.
         """
         self._hang_up()
         if not self._reading:

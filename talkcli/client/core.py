@@ -83,9 +83,8 @@ class EventBuffer:
     def add(self, event: Event) -> None:
         """Add an event unless it is a duplicate.
 
-        Close the buffer if too many state changes are unread.
-
-        A connection that waits for a goal and also watches all goals receives each state twice.
+        Close the buffer if too many state changes are unread. A closed buffer ignores all events. A connection that
+        waits for a goal and also watches all goals receives each state twice.
         """
         number = getattr(event, "n", None)
         if number is not None and number == self._last_number:
@@ -120,7 +119,10 @@ class EventListeners:
         self.watches: WeakSet[EventBuffer] = WeakSet()
 
     def add(self, tracked: TrackedGoal) -> None:
-        """Pass a goal's events and all pauses to `tracked`."""
+        """Pass a goal's events and all pauses to `tracked`.
+
+        This ends when the goal has ended or is lost.
+        """
         self._goals.setdefault(tracked.goal.id, set()).add(tracked)
 
     @property
@@ -450,7 +452,10 @@ class ClientCore:
         return sum(len(line) for line, _ in self._unsent) - self._first_sent_bytes
 
     def outgoing(self) -> bytes:
-        """Return the bytes that can be sent now."""
+        """Return the bytes that can be sent now.
+
+        Requests wait for the server's greeting.
+        """
         if self._hello or not self.greeted:
             return self._hello
         return b"".join(line for line, _ in self._unsent)[self._first_sent_bytes :]
@@ -551,7 +556,10 @@ class ClientCore:
     # -- time limits
 
     def answer_deadline(self, exchange: Exchange) -> float:
-        """Return the time at which an exchange without progress fails."""
+        """Return the time at which an exchange without progress fails.
+
+        The request must be sent, or the next line of its answer must arrive, by this time.
+        """
         if exchange.sent:
             return float("inf") if exchange.slow else exchange.heard_at + self._patience
         ttl = exchange.request.ttl if isinstance(exchange.request, Say) else None
@@ -714,7 +722,10 @@ class ClientCore:
         self.begin_stream()
 
     def not_connected(self, error: TalkError) -> None:
-        """Record a failed attempt to reconnect, and fail requests that callers wait for."""
+        """Record a failed attempt to reconnect, and fail requests that callers wait for.
+
+        These are the exchanges without an `on_failure`.
+        """
         self.connect_error = error
         for exchange in [each for each in self.exchanges.values() if not each.on_failure]:
             self.forget(exchange)
@@ -723,9 +734,8 @@ class ClientCore:
     def connected(self, server: ServerInfo, now: float) -> None:
         """Record the greeting on a new connection.
 
-        Follow all goals again, or end them as LOST.
-
-        Goals are followed again if the server wasn't restarted in the meantime. Otherwise they are LOST.
+        Follow all goals again, or end them as LOST. Goals are followed again if the server wasn't restarted in the
+        meantime. Otherwise they are LOST.
 
         Args:
             server: the server's greeting. Each start of the server has another boot id.

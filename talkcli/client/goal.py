@@ -30,11 +30,9 @@ if TYPE_CHECKING:
 class GoalHandle(TrackedGoal):
     """A handle for a goal that this client has sent or follows.
 
-    Any number of threads may use it.
-
-    Events are buffered until they are read. If there are more than 5,000 words and pauses, the oldest are dropped.
-    `events`, `feedback` and `poll` read from the same buffer, so each event is returned only once. A new loop continues
-    where an interrupted one stopped. Each thread needs an iterator of its own.
+    Any number of threads may use it. Events are buffered until they are read. If there are more than 5,000 words and
+    pauses, the oldest are dropped. `events`, `feedback` and `poll` read from the same buffer, so each event is returned
+    only once. A new loop continues where an interrupted one stopped. Each thread needs an iterator of its own.
     """
 
     def __init__(self, connection: Connection, goal: Goal) -> None:
@@ -59,10 +57,8 @@ class GoalHandle(TrackedGoal):
     def wait(self, timeout: float | None = None) -> Goal:
         """Wait until the goal has ended, and return it.
 
-        Raise TimeoutError if `timeout` expires first.
-
-        If the goal can no longer be followed, for example because the server was restarted, the goal ends as LOST. It
-        may or may not have been spoken.
+        Raise TimeoutError if `timeout` expires first. If the goal can no longer be followed, for example because the
+        server was restarted, the goal ends as LOST. It may or may not have been spoken.
 
         Args:
             timeout: time limit in seconds; None for no limit.
@@ -111,10 +107,8 @@ class GoalHandle(TrackedGoal):
     def poll(self) -> Event | None:
         """Read from the server without blocking.
 
-        Return the goal's next event, or None if there is none.
-
-        The Result is the last event. Call this method regularly, because each call also receives the events of other
-        goals, and sends the rest of earlier requests.
+        Return the goal's next event, or None if there is none. The Result is the last event. Call this method
+        regularly, because each call also receives the events of other goals, and sends the rest of earlier requests.
 
         Raises:
             UsageError: the goal was sent with `follow=False`, and neither `wait` nor `events` has been called.

@@ -186,10 +186,9 @@ class BrokerExamination:
     def _test_rights(self, link: Link, user: str) -> tuple[Finding, dict[str, Presence]]:
         """Test the user's access rights by publishing messages.
 
-        Return the finding, and the presences of robots by name.
-
-        The user needs the rights of an operator, or those of this robot's bridge. Other robots are only read if this
-        robot's presence is missing, and the user isn't the robot.
+        Return the finding, and the presences of robots by name. The user needs the rights of an operator, or those of
+        this robot's bridge. Other robots are only read if this robot's presence is missing, and the user isn't the
+        robot.
         """
         robot, replies = partial(topics.robot, self._robot), partial(topics.reply, user, os.urandom(8).hex())
         if self._is_robot:

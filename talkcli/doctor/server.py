@@ -47,7 +47,7 @@ PLACE_STOPPED = "a stopped process is listening"
 #: Advice if the server refuses the client, by error code.
 _REFUSAL_ADVICE = {
     "protocol_mismatch": "install the same version of talk for the server and its clients, and restart the server",
-    "busy": "end some clients, or raise the limit named above: talk serve --max-clients 512, or LimitNOFILE=",
+    "busy": "end some clients, or raise the limit in the message: talk serve --max-clients 512, or LimitNOFILE=",
     "permission_denied": "ask its owner for access: talk serve --socket-mode 0660, and join the socket's group",
 }
 #: Advice for each kind of place. If several kinds were found, the first one in this table counts.
@@ -84,9 +84,7 @@ class SocketPlace:
 def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Client | None, Finding]:
     """Connect to the server.
 
-    Return the client, if connected, and the finding about the server's socket.
-
-    The client is None if no connection was possible.
+    Return the client, or None, and the finding about the server's socket.
 
     Args:
         option: the value of --socket.
@@ -150,9 +148,8 @@ def request_status_and_log(client: Client) -> tuple[JsonObject, list[Goal]]:
 def local_pid(client: Client) -> int | None:
     """Return the server's process id, or None if the server runs elsewhere.
 
-    The server's socket may be forwarded by ssh, for example.
-
-    If systemd created the socket, the kernel reports systemd as the listening process.
+    The server's socket may be forwarded by ssh, for example. If systemd created the socket, the kernel reports systemd
+    as the listening process.
     """
     pid = client._connection.listener
     is_local = pid is not None and (pid == client.server_pid or peers.command_name(pid) == "systemd")

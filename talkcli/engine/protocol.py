@@ -157,7 +157,10 @@ class Continue:
 
 @frozen
 class NextGoal:
-    """The command that describes the next goal in the queue."""
+    """The command that describes the next goal in the queue.
+
+    It replaces `next_waits` and `next_is_neural` of the current goal.
+    """
 
     id: str  # ID of the current goal
     next_waits: bool  # whether another goal is waiting in the queue

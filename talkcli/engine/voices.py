@@ -307,9 +307,8 @@ def _names_of(voice: Voice) -> tuple[str, str, str, str]:
 def _find_variant(suffix: str, variants: list[Voice]) -> Voice | None:
     """Find a variant by the part of a voice's name after the "+".
 
-    Return None if there is none.
-
-    As in libespeak-ng, the numbers 1 to 9 select male variants, and the numbers from 11 on select female variants.
+    Return None if there is none. As in libespeak-ng, the numbers 1 to 9 select male variants, and the numbers from 11
+    on select female variants.
     """
     word = suffix.casefold()
     if word.isdecimal() and word.isascii() and len(word) < 3:

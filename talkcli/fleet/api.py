@@ -112,14 +112,13 @@ class Fleet:
     ) -> FleetRequest:
         """Cancel goals on each robot, by default all of them.
 
-        Return the request, which yields the outcomes.
-
-        The other arguments are those of `Client.cancel`. The outcome of a robot arrives when the robot is silent.
+        Return the request, which yields the outcomes. The other arguments are those of `Client.cancel`. The outcome of
+        a robot arrives when the robot is silent.
         """
         return self._send_request(to, Cancel(None if ids is None else tuple(ids), current, before, key))
 
     def wait(self, to: str, ids: Iterable[str] | None = None) -> FleetRequest:
-        """Wait for goals on each robot, by default all current ones.
+        """Wait for goals on each robot to end, by default all current ones.
 
         Return the request, which yields the outcomes.
         """
@@ -128,9 +127,7 @@ class Fleet:
     def status(self, to: str) -> FleetRequest:
         """Request the status of each robot's server.
 
-        Return the request, which yields the outcomes.
-
-        Each outcome contains the status as `said["status"]`.
+        Return the request, which yields the outcomes. Each outcome contains the status as `said["status"]`.
         """
         return self._send_request(to, Status())
 
@@ -148,9 +145,8 @@ class Fleet:
     def set(self, to: str, **settings: Any) -> FleetRequest:
         """Change the settings of each robot's server.
 
-        Return the request, which yields the outcomes.
-
-        If a robot's bridge doesn't allow this, its outcome is REFUSED. The arguments are those of `Client.set`.
+        Return the request, which yields the outcomes. If a robot's bridge doesn't allow this, its outcome is REFUSED.
+        The arguments are those of `Client.set`.
         """
         return self._send_request(to, Set(**settings))
 

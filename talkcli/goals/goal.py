@@ -97,9 +97,8 @@ class Output:
 class Goal:
     """An immutable copy of a goal.
 
-    Its JSON always contains all keys, with null for unknown values.
-
-    Times are seconds since 1970 UTC. `duration` is the length of the audio in seconds.
+    Its JSON always contains all keys, with null for unknown values. Times are seconds since 1970 UTC. `duration` is the
+    length of the audio in seconds.
     """
 
     id: str

@@ -65,7 +65,10 @@ _MAX_FLOAT = 1.7976931348623157e308
 
 
 def without_speaker(voice: str | None) -> str:
-    """Return the id of a voice without its speaker."""
+    """Return the id of a voice without its speaker.
+
+    Return an empty string if the voice is None.
+    """
     return (voice or "").partition(SPEAKER_MARK)[0]
 
 
@@ -354,7 +357,7 @@ OPTIONS = (
         setting=Setting(
             False,
             meaning="whether goals that were sent without `preempt` interrupt the current goal",
-            set_help="Choose whether new sentences interrupt the current one. Otherwise, they wait in the queue.",
+            set_help="Choose whether new sentences interrupt the current one. 'talk say --queue' always waits.",
             serve_help="Let new sentences interrupt the current sentence. 'talk say --queue' always waits.",
             flags="--preempt/--no-preempt",
             words="new goals interrupt",
@@ -376,8 +379,8 @@ OPTIONS = (
         # The range is not in `limits`, because the help text would then show it.
         check=_check_priority,
         form=f"{-MAX_PRIORITY:,} to {MAX_PRIORITY:,}",
-        help="Set the priority. Sentences with a higher priority are spoken first, and this sentence never "
-        "interrupts them.",
+        help="Set the priority. Sentences with a higher priority are spoken first. This sentence never interrupts or "
+        "flushes them.",
         in_goal=True,
     ),
     Option(
@@ -413,7 +416,7 @@ OPTIONS = (
         "reject the goal if the same text is waiting, is being spoken, or started less than this many seconds ago. For "
         "a goal with a key, keys are compared instead of texts, and waiting goals are ignored",
         limits=(0, None),
-        help="Skip the sentence if it was spoken in the last SEC seconds. With --key, all sentences with it count.",
+        help="Skip the sentence if it was spoken in the last SEC seconds. With --key, sentences with this KEY count.",
     ),
     Option(
         "id",
@@ -457,7 +460,7 @@ OPTIONS = (
         setting=Setting(
             None,
             none_value=DEFAULT_VOICE,
-            set_help="Use this voice. It is an id, name or language from 'talk voices', or 'default'.",
+            set_help="Use this voice: an id, name or language from 'talk voices'. 'default' is the engine's own.",
             words="voice {}",
             none_words="default voice",
         ),
@@ -668,7 +671,8 @@ class Cancel:
     def select_waiting(self, goals: Sequence[Say]) -> list[int]:
         """Return the indexes of the waiting goals that the request cancels.
 
-        Such goals have an id only if their sender chose one, so `before` selects them only if it names such an id.
+        All these goals wait for room in the queue. They have an id only if their sender chose one, so `before` selects
+        them only if it names such an id.
         """
         ids = set(self.ids or ())
         last = max((index for index, say in enumerate(goals) if say.id == self.before is not None), default=-1)

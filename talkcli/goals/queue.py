@@ -82,6 +82,8 @@ class Queue:
     def add(self, record: Record, replaced: Record | None = None) -> None:
         """Add a goal at its place in the speaking order.
 
+        This is behind the other goals of its priority, or in front of them if the goal preempts.
+
         Args:
             record: the new goal.
             replaced: a goal of the same priority that was removed. The new goal takes its place in the queue.
@@ -101,7 +103,10 @@ class Queue:
             del self._by_key[record.say.key]
 
     def next_expiry(self) -> float:
-        """Return the monotonic time at which the next goal expires."""
+        """Return the monotonic time at which the next goal expires.
+
+        Return inf if no goal can expire.
+        """
         return self._expiries[0][0] if self._expiries else inf
 
     def expired(self, now: float) -> list[Record]:

@@ -150,7 +150,10 @@ class Scheduler:
         return ([self.active] if self.active else []) + list(self.pending)
 
     def find(self, goal_id: str) -> Record | None:
-        """Return the goal with this id, or None if it is unknown."""
+        """Return the goal with this id, or None if it is unknown.
+
+        Goals that ended long ago are forgotten.
+        """
         return self._by_id.get(goal_id) or self.history.find(goal_id)
 
     def has_room(self, say: Say) -> bool:
@@ -189,7 +192,7 @@ class Scheduler:
     ) -> tuple[Record, list[Effect]]:
         """Reject a goal or add it to the queue.
 
-        Return its record, and the effects to carry out.
+        Return its record, and the effects to carry out. A rejected goal doesn't affect other goals.
 
         Args:
             say: the goal.
@@ -210,7 +213,7 @@ class Scheduler:
         ttl = (self.settings.ttl if say.ttl is None else say.ttl) or None
         expires_at = inf if ttl is None else now.monotonic + ttl - waited_s
         number, asked = self._count, say if ttl == say.ttl else replace(say, ttl=ttl)
-        record = Record(f"{self.boot}-{number}", number, asked, sender, now.wall, self._preempts(say), expires_at)
+        record = Record(f"{self.boot}-{number}", number, asked, sender, now.wall, self._may_preempt(say), expires_at)
         record.first_chars = len(say.text)
         by = canceled or self._early_cancels.find(say.id, now.monotonic)
         refused = self._find_refusal(say, refusal, first) or (None if canceled else self._throttle(say, record, now))
@@ -243,7 +246,7 @@ class Scheduler:
     ) -> Cancellation:
         """Cancel the selected goals, and remember cancels for unknown ids.
 
-        The result contains the effects.
+        Pending goals end at once. The active goal ends when the engine is silent. The result contains the effects.
 
         Args:
             selection: the goals to cancel.
@@ -334,9 +337,7 @@ class Scheduler:
     def change_settings(self, changes: dict[str, object], now: Now) -> list[Effect]:
         """Change the settings for goals that have not started.
 
-        Return the effects.
-
-        A new voice that failed to load earlier is loaded again.
+        Return the effects. A new voice that failed to load earlier is loaded again.
         """
         self.settings = replace(self.settings, **changes)
         voice = changes.get("voice")
@@ -346,7 +347,10 @@ class Scheduler:
         return self.tick(now)  # the next goal may not have to wait for its voice any more
 
     def pause(self) -> list[Effect]:
-        """Pause the active goal, and prevent others from starting."""
+        """Pause the active goal, and prevent others from starting.
+
+        The pause lasts until `resume` is called.
+        """
         if self.paused:
             return []
         self.paused = True
@@ -385,13 +389,16 @@ class Scheduler:
     def engine_lost(self, now: Now) -> list[Effect]:
         """Record that the engine process has exited.
 
-        Return warnings about voices.
+        No goal starts until a new engine is ready. Return warnings about voices.
         """
         self.has_engine = self._loads_voices = False
         return [*self.voices.engine_lost(now.monotonic)]
 
     def engine_ready(self, now: Now) -> list[Effect]:
-        """Record that an engine is ready, and start the next goal."""
+        """Record that an engine is ready, and start the next goal.
+
+        Return the effects, which also load the voices that goals need.
+        """
         self.has_engine = self._loads_voices = True
         for voice in (*self._needed_voices(), self.settings.voice or ""):
             self._request_voice(voice, now)
@@ -400,7 +407,7 @@ class Scheduler:
     def engine_unavailable(self, now: Now) -> list[Effect]:
         """Record that no engine can be started.
 
-        Return the effects.
+        From now on, goals fail at once instead of waiting. Return the effects.
         """
         self.has_engine, self._loads_voices = True, False
         return self._start_next(now)
@@ -458,7 +465,10 @@ class Scheduler:
         return self._order_next_voice(now)
 
     def output_changed(self, goal_id: str, output: Output | None) -> None:
-        """Record the audio output of the active goal."""
+        """Record the audio output of the active goal.
+
+        `output` is None if it is unknown.
+        """
         self._require_active(goal_id).output = output
 
     def completed(
@@ -493,10 +503,8 @@ class Scheduler:
     def failed(self, goal_id: str, reason: Reason, message: str, duration: float | None, now: Now) -> list[Effect]:
         """End the active goal as ABORTED, or as PREEMPTED if it was being stopped.
 
-        Return the effects.
-
-        If the goal was being stopped, the failure has silenced it, so it ends PREEMPTED. It ends ABORTED only with the
-        reason `not_silent`.
+        Return the effects. If the goal was being stopped, the failure has silenced it, so it ends PREEMPTED. It ends
+        ABORTED only with the reason `not_silent`.
         """
         record = self._require_active(goal_id)
         record.duration = duration
@@ -557,7 +565,10 @@ class Scheduler:
     # -- time limits
 
     def deadline(self) -> float:
-        """Return the monotonic time at which `tick` must be called next."""
+        """Return the monotonic time at which `tick` must be called next.
+
+        Return inf if there is no time limit.
+        """
         orphans = min((each.orphaned_until for each in self._orphans), default=inf)
         return min(self._active_deadline(), self.pending.next_expiry(), self._next_deadline(), orphans)
 
@@ -632,8 +643,6 @@ class Scheduler:
     def _throttle(self, say: Say, record: Record, now: Now) -> Refusal | None:
         """Return a refusal if a goal repeats another one too soon.
 
-        May set `record.by`.
-
         If the goal is rejected, `record.by` is set to the other goal.
         """
         if say.throttle is None:
@@ -653,8 +662,8 @@ class Scheduler:
         what = "the same text" if say.key is None else "a goal with this key"
         return Reason.THROTTLED, f"{what} {words}"
 
-    def _preempts(self, say: Say) -> bool:
-        """Return whether a goal interrupts others."""
+    def _may_preempt(self, say: Say) -> bool:
+        """Return whether a goal asks to interrupt others, itself or by the server's setting."""
         return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)
 
     def _find_room(self, say: Say) -> list[tuple[Record, Reason]] | None:
@@ -663,7 +672,7 @@ class Scheduler:
         preempted: list[Record] = []
         if say.flush:
             preempted = self.pending.goals_up_to(say.priority)
-        elif self._preempts(say):
+        elif self._may_preempt(say):
             preempted = self.pending.preempting_goals_up_to(say.priority)
         recalled = [(replaced, Reason.REPLACED)] if replaced else []
         recalled += [(each, Reason.PREEMPTED) for each in preempted if each is not replaced]
@@ -711,10 +720,8 @@ class Scheduler:
     def _order_next_voice(self, now: Now) -> list[Effect]:
         """Choose the next voice to load, and mark it as loading.
 
-        Return a list with the order, if any.
-
-        The first voice is not loaded while a goal is active. Loading it imports libraries, which blocks the engine
-        process for a tenth of a second.
+        Return a list with the order, if any. The first voice is not loaded while a goal is active. Loading it imports
+        libraries, which blocks the engine process for a tenth of a second.
         """
         if not (self._loads_voices and self.voices.can_load) or self.closing:
             return []
@@ -781,9 +788,8 @@ class Scheduler:
     def _activate_next(self, now: Now) -> tuple[Record | None, list[Effect]]:
         """Make the next goal ACTIVE if possible.
 
-        Return it, and the effects without the order to speak it.
-
-        Return None instead of a goal if no goal can start now.
+        Return it, and the effects without the order to speak it. Return None instead of a goal if no goal can start
+        now.
         """
         if self.active or self.paused:
             return None, []

@@ -170,8 +170,8 @@ class VoiceScheduler:
     def load_next(self, needed: Sequence[str], default_voice: str, now: float) -> VoiceLoadOrder | None:
         """Choose the next voice to load, and return the order.
 
-        Call this only if `can_load` is true. A loaded voice is not dropped if a goal needs it sooner than the next
-        voice, because it would have to be loaded again.
+        Return None if no voice can be loaded now. Call this only if `can_load` is true. A loaded voice is not dropped
+        if a goal needs it sooner than the next voice, because it would have to be loaded again.
 
         Args:
             needed: the voices that waiting goals need, in the order of the goals.
@@ -199,9 +199,8 @@ class VoiceScheduler:
     def drop_excess(self, first: str, needed: Sequence[str]) -> list[VoiceDropOrder | VoiceWarning]:
         """Choose the voices to drop to meet the memory limit.
 
-        Return the orders to drop them, and any warnings.
-
-        This is necessary if the voices use more memory than was estimated.
+        Return the orders to drop them, and any warnings. This is necessary if the voices use more memory than was
+        estimated.
 
         Args:
             first: the voice that speaks now or next. It is never dropped.

@@ -276,7 +276,12 @@ def busy_greeting(message: str | None = None) -> JsonObject:
 
 
 def check_greeting(message: JsonObject) -> None:
-    """Raise an error if a greeting shows that this client can't use the server."""
+    """Raise an error if a greeting shows that this client can't use the server.
+
+    Raises:
+        ProtocolMismatch: the server uses another version of the protocol.
+        Busy: the server is full.
+    """
     theirs = message.get("talk")
     if theirs != PROTOCOL or isinstance(theirs, bool):
         server = ascii(message.get("version", "unknown"))

@@ -53,7 +53,7 @@ class LineSplitter:
     def feed(self, data: bytes) -> list[bytes]:
         """Add received bytes, and return the lines that are now complete.
 
-        A line that is too long is truncated.
+        The lines don't contain their newlines. A line that is too long is truncated.
         """
         *lines, rest = data.split(b"\n")
         for place, line in enumerate(lines):
@@ -64,7 +64,10 @@ class LineSplitter:
         return lines
 
     def take_rest(self) -> bytes:
-        """Remove and return the incomplete line."""
+        """Remove and return the incomplete line.
+
+        Return b"" if there is none.
+        """
         line = bytes(self._rest)
         if self.size > self._max_bytes:
             line = TruncatedLine(line)

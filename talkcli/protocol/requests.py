@@ -149,6 +149,8 @@ REQUEST_TYPES: dict[str, type[Request]] = {each.kind: each for each in Request._
 def read_request(message: JsonObject) -> Request:
     """Check a JSON object, and return the request in it.
 
+    The caller must have removed `seq` from the object.
+
     Raises:
         BadRequest: the request is malformed.
     """

@@ -331,9 +331,8 @@ class ClientConnection(asyncio.Protocol):
     def _update_reading(self) -> None:
         """Start or stop reading from the client.
 
-        Also start or cancel the time limit for an incomplete line.
-
-        The server reads only while the client reads its replies and has few unprocessed lines.
+        Also start or cancel the time limit for an incomplete line. The server reads only while the client reads its
+        replies and has few unprocessed lines.
         """
         if self.stream.closing:
             return

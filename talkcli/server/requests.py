@@ -300,9 +300,8 @@ class Requests:
     def _check_goal(self, pending: PendingRequest, say: Say) -> tuple[Say, Refusal | None]:
         """Fill in the id of a goal's voice.
 
-        Return the new goal, and the reason to refuse it, if any.
-
-        Refusals that need a clock, files or other I/O belong here. The scheduler decides about all others.
+        Return the new goal, and the reason to refuse it, if any. Refusals that need a clock, files or other I/O belong
+        here. The scheduler decides about all others.
         """
         voice, refusal = self._speech.voices.look_up(say.voice, self._scheduler.settings.voice)
         say = replace(say, voice=voice)

@@ -140,7 +140,7 @@ class Server:
             self._loop.add_signal_handler(number, self._on_signal, number)
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # keep running when the terminal is closed
         signal.pthread_sigmask(signal.SIG_SETMASK, ())  # unblock signals that the parent process may have blocked
-        voice = self._prepare_voice()
+        voice = self._apply_configured_voice()
         speech.engine = Supervisor(
             protocol.Configure(
                 os.getpid(),
@@ -182,12 +182,10 @@ class Server:
         if self._fatal_error:
             raise self._fatal_error
 
-    def _prepare_voice(self) -> str | None:
-        """Return the configured voice if the engine must check it.
+    def _apply_configured_voice(self) -> str | None:
+        """Set a configured neural voice, or return another voice, which the engine must check.
 
-        A neural voice is checked here.
-
-        A neural voice becomes a setting and is loaded later, so that it doesn't delay speech.
+        A neural voice is loaded later, so that it doesn't delay speech.
 
         Raises:
             UsageError: if a neural voice is unknown.

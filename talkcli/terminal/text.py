@@ -186,9 +186,7 @@ def fit_row(head: str, text: str, details: Sequence[str], text_columns: int, scr
 def wrap(pieces: Sequence[str], head: str, screen: Screen) -> list[str]:
     """Join pieces of text, and wrap them to fit the screen.
 
-    `head` starts the first line.
-
-    The other lines are indented by its width. Lines are only broken between pieces.
+    `head` starts the first line. The other lines are indented by its width. Lines are only broken between pieces.
     """
     columns = screen.columns_left(width(head))
     lines = [pieces[0]]

@@ -18,7 +18,8 @@ def test_the_socket_of_the_user_who_called_sudo_is_named_only_if_it_exists(
 ) -> None:
     uid = os.getuid()
     monkeypatch.setattr(os, "getuid", lambda: 0)
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    # A server of this user may be running in a real one of these directories.
+    monkeypatch.setattr(paths, "_runtime_directories", lambda user: [f"{tmp_path}/runtime-{user}"])
     monkeypatch.setenv("SUDO_UID", str(uid))
     assert paths.sudo_caller_socket() is None
     socket = tmp_path / f"runtime-{uid}" / "talk" / paths.SOCKET_NAME

@@ -173,10 +173,9 @@ class DriverProperties:
     def apply(self, command: protocol.Speak) -> str | None:
         """Set the properties for a goal.
 
-        Return the reason if another voice had to be used, otherwise None.
-
-        A neural voice may have disappeared since the goal was accepted. The driver then falls back to another of its
-        voices, preferably in the same language. It doesn't do so if `voice_only` is set.
+        Return the reason if another voice had to be used, otherwise None. A neural voice may have disappeared since the
+        goal was accepted. The driver then falls back to another of its voices, preferably in the same language. It
+        doesn't do so if `voice_only` is set.
 
         Returns:
             The reason for the fallback, or None if the goal has the requested voice.

@@ -78,9 +78,8 @@ def _die_with_parent() -> None:
 def _limit_core_dump() -> None:
     """Prevent core dumps if a text crashes the library.
 
-    A dump takes longer than a restart, and wears out SD cards.
-
-    The limit is one byte. With a limit of 0, the kernel would still pipe the core to a program that collects cores.
+    A dump takes longer than a restart, and wears out SD cards. The limit is one byte. With a limit of 0, the kernel
+    would still pipe the core to a program that collects cores.
     """
     _, hard = resource.getrlimit(resource.RLIMIT_CORE)
     resource.setrlimit(resource.RLIMIT_CORE, (1 if hard else 0, hard))

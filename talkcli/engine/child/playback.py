@@ -294,7 +294,7 @@ class Playback:
     # -- methods for the synthesizer
 
     def begin(self, rate: int, voice: str, fallback_reason: str | None = None) -> None:
-        """Set the sample rate, and start a player unless the goal is paused.
+        """Set the sample rate, report the voice, and start a player if it plays in real time and may play now.
 
         The player starts in 1 to 15 ms, while the synthesizer produces the first samples. `write` raises its errors.
 
@@ -306,7 +306,7 @@ class Playback:
         if self._feed is not None and rate != self._rate:
             if self._part_begin:
                 raise CannotSpeak(Reason.ENGINE_FAILED, "the rest of the text would need another sample rate")
-            self._release_player(0)  # the player was started with a different sample rate
+            self._replace_player(0)  # the player was started with a different sample rate
         self._rate = rate
         self._runner.report_voice(voice, fallback_reason)
         if self._players.takes_time and not self._runner.hold_number:
@@ -434,9 +434,8 @@ class Playback:
     def _with_player(self, step: Callable[[PlayerFeed], None]) -> None:
         """Call `step` with the current player.
 
-        If the player fails or was released, call `step` with the next player.
-
-        The call is repeated if the player fails before any sound was heard, or was released during a pause.
+        If the player fails or was released, call `step` with the next player. The call is repeated if the player fails
+        before any sound was heard, or was released during a pause.
         """
         while True:
             self._raise_if_stopped()
@@ -495,12 +494,9 @@ class Playback:
         self._busy_until = self._busy_until or time.monotonic() + DEVICE_BUSY_LIMIT_S
         return time.monotonic() < self._busy_until
 
-    def _release_player(self, next_begin: int) -> None:
-        """Kill the player.
-
-        The best player then continues the sentence at the offset `next_begin`.
-        """
-        self._begin = self._sent = next_begin
+    def _replace_player(self, resume_at: int) -> None:
+        """Kill the player, so that the best one continues the sentence at the offset `resume_at`."""
+        self._begin = self._sent = resume_at
         self._untried = self._first_error = None
         self.silence()
 
@@ -510,7 +506,7 @@ class Playback:
         The next player repeats the unheard sound.
         """
         feed.update(time.monotonic(), complete=False)
-        self._release_player(self._unheard_begin() if feed.player.proven else self._begin)
+        self._replace_player(self._unheard_begin() if feed.player.proven else self._begin)
 
     # -- steps
 
@@ -575,10 +571,9 @@ class Playback:
     def _skip_leading_zeros(self) -> bool:
         """Decide how many leading zero samples to skip.
 
-        Return False if it is too early to decide.
-
-        Zeros before the first sound are skipped, so that it is heard earlier. They are kept in a file. They are also
-        kept after another sentence, because they are part of the silence between the two sentences.
+        Return False if it is too early to decide. Zeros before the first sound are skipped, so that it is heard
+        earlier. They are kept in a file. They are also kept after another sentence, because they are part of the
+        silence between the two sentences.
         """
         if self._start_known:
             return True
@@ -676,7 +671,7 @@ class Playback:
             except CannotSpeak:
                 due = 0.0  # a player that fails during a pause is replaced
             if time.monotonic() >= due:
-                self._release_player(self._sent)  # everything sent so far has been heard
+                self._replace_player(self._sent)  # everything sent so far has been heard
                 raise _PlayerReleased
             if not taken:
                 self._wait_for_player(feed, due)

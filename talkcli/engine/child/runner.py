@@ -228,9 +228,8 @@ class GoalRunner:
     def wait(self, interests: Iterable[Interest] = (), until: float = NEVER) -> None:
         """Wait for a descriptor, a command or a time limit.
 
-        Execute arriving commands, and send events that are due.
-
-        This method may return early. By then, a command may have stopped or paused the sentence.
+        Execute arriving commands, and send events that are due. This method may return early. By then, a command may
+        have stopped or paused the sentence.
 
         Args:
             interests: the descriptors, with the poll events to wait for.
@@ -462,9 +461,8 @@ class GoalRunner:
     def _notice_overdue(self, goal: ActiveGoal) -> bool:
         """Return whether a third-party driver takes too long for the text.
 
-        Log this once for each goal.
-
-        The process then sends no `Alive`, so that the server kills it. There may be no other way to stop the driver.
+        Log this once for each goal. The process then sends no `Alive`, so that the server kills it. There may be no
+        other way to stop the driver.
         """
         if self._pump is None or not goal.with_driver:
             return False

@@ -113,9 +113,7 @@ class EngineProcess:
     def receive(self) -> Iterator[protocol.Event | None]:
         """Yield the events that have arrived, without blocking.
 
-        The last one is None if the connection has ended.
-
-        A malformed message counts as the end of the connection.
+        The last one is None if the connection has ended. A malformed message counts as the end of the connection.
         """
         try:
             data = self.socket.recv(65536)

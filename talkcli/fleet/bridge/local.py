@@ -85,10 +85,7 @@ class LocalConnection(ClientCore):
         return lines
 
     def send(self, exchange: Exchange) -> bool:
-        """Send the request of an exchange, which will receive the answer.
-
-        Return False if the request is too long.
-        """
+        """Send an exchange's request, or return False if the request is too long."""
         self.register(exchange, self._loop.time())
         line = self.line(exchange)
         if len(line) > MAX_LINE_BYTES:
@@ -102,9 +99,8 @@ class LocalConnection(ClientCore):
     def close(self) -> None:
         """Close the connection.
 
-        A waiting `read` must first be canceled, or ended with `abort`.
-
-        The server cancels the requests that it has not answered, if possible.
+        A waiting `read` must first be canceled, or ended with `abort`. The server cancels the requests that it has not
+        answered, if possible.
         """
         if self._socket.fileno() >= 0:
             self._loop.remove_reader(self._socket)

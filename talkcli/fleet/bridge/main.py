@@ -329,9 +329,8 @@ class Bridge:
     def _publish(self, message: Message, qos: int = 1, acknowledged: OnAcknowledged | None = None) -> None:
         """Publish a message if there is a connection.
 
-        Drop it if it is too long for the broker.
-
-        The arguments are those of `Link.publish`. By default, a warning is logged if the broker rejects the message.
+        Drop it if it is too long for the broker. The arguments are those of `Link.publish`. By default, a warning is
+        logged if the broker rejects the message.
         """
         link = self._link
         if link is None:
@@ -414,9 +413,8 @@ class Bridge:
     def _handle_presence(self, payload: bytes) -> None:
         """Check a presence message for another bridge with this robot's name.
 
-        The younger of the two bridges ends.
-
-        It may come from this bridge, an earlier one, or another one with the same robot name.
+        The younger of the two bridges ends. It may come from this bridge, an earlier one, or another one with the same
+        robot name.
         """
         presence = Presence.read(self._settings.name, payload)
         rank = bridge_rank(presence)

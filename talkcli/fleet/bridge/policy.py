@@ -275,9 +275,7 @@ class RemoteGoals:
     def record_reply(self, goal_id: str, *, pending: bool) -> None:
         """Record from the server's reply to `say` whether a goal is pending.
 
-        If it isn't, remove the goal.
-
-        The reply is ignored if an event has already confirmed that the goal is pending.
+        If it isn't, remove the goal. The reply is ignored if an event has already confirmed that the goal is pending.
 
         Args:
             goal_id: the goal's id.

@@ -135,9 +135,7 @@ class RemoteSessions:
     def _make_room(self, *, urgent: bool) -> bool:
         """End an idle session if there are too many sessions.
 
-        Return whether there is room for a new one.
-
-        For an `urgent` request, any session may be ended.
+        Return whether there is room for a new one. For an `urgent` request, any session may be ended.
         """
         if len(self._sessions) < MAX_SESSIONS:
             return True
@@ -202,9 +200,8 @@ class RemoteSessions:
     def remember(self, goal: Goal, boot: str) -> None:
         """Remember the id of a remote client's goal, in case an earlier bridge process sent it.
 
-        Ignore other goals.
-
-        The goal counts towards the limit even if it was sent with `preempt`, because the server doesn't report that.
+        Ignore other goals. The goal counts towards the limit even if it was sent with `preempt`, because the server
+        doesn't report that.
         """
         if (user := policy.remote_user(goal)) and self.ids.boot_of(goal.id) != boot:
             self.ids.add(goal.id, boot, user)

@@ -293,10 +293,7 @@ class DeskLink:
         return TICK_EVERY_S if self._opening else max(0.0, self._next_attempt_at - now)
 
     def _end_attempt(self, opening: LinkOpener) -> None:
-        """Start using a newly opened connection.
-
-        If it could not be opened, schedule the next attempt.
-        """
+        """Use the newly opened connection, or schedule another attempt if it could not be opened."""
         self._opening = None
         if opening.error is not None:
             self._failed_attempts += 1

@@ -256,9 +256,8 @@ class RobotConnection(Connection):
     def _update_presence(self, payload: bytes) -> None:
         """Read from a presence message whether the robot is absent.
 
-        When it is back, send open requests again.
-
-        It comes from the robot's bridge, or from the broker if the bridge has lost its connection.
+        When it is back, send open requests again. It comes from the robot's bridge, or from the broker if the bridge
+        has lost its connection.
         """
         try:
             presence = decode(payload.strip())

@@ -290,11 +290,10 @@ class FleetRequest:
     def _on_presence(self, robot: RobotRequest, presence: Presence) -> None:
         """Include a robot in the request when its presence first arrives.
 
-        Send the request if possible.
-
-        After all retained messages have arrived, new robots are ignored, because they came online too late. Until then,
-        every member of a group is expected to answer. Some members may have come online after the request was sent, but
-        they can't be recognized, because some brokers send retained messages late.
+        Send the request if possible. After all retained messages have arrived, new robots are ignored, because they
+        came online too late. Until then, every member of a group is expected to answer. Some members may have come
+        online after the request was sent, but they can't be recognized, because some brokers send retained messages
+        late.
         """
         name = presence.name
         if name in self._included:

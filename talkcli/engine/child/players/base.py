@@ -129,11 +129,15 @@ class Player(Protocol):
     def interests(self) -> Sequence[Interest]:
         """Return the descriptors to poll, each with its poll events.
 
-        The playback ignores descriptors that only wait for POLLOUT while it has no samples to offer.
+        These are the open descriptors that report room for samples, a failure or the end of the player. The playback
+        ignores descriptors that only wait for POLLOUT while it has no samples to offer.
         """
 
     def wake_at(self) -> float:
-        """Return when to check the player again, or NEVER if polling is enough."""
+        """Return when to check the player again, or NEVER if polling is enough.
+
+        The result is a time of the monotonic clock.
+        """
 
     def kill(self) -> None:
         """Stop playing at once, and start to release all resources.
@@ -144,5 +148,6 @@ class Player(Protocol):
     def gone(self) -> bool:
         """Return whether the player is silent and has released its resources.
 
-        It is called every 20 ms after `kill`. If it still returns False after one second, the engine process exits.
+        Return True only if the player is certainly silent and its descriptors, processes and threads are gone. This
+        method is called every 20 ms after `kill`. If it still returns False after one second, the engine process exits.
         """

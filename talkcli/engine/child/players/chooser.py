@@ -146,9 +146,8 @@ class PlayerChooser:
     def update_output(self, player: Player) -> None:
         """Record the output of a player.
 
-        If the player was chosen automatically and works, also record its name.
-
-        A sentence that was ever muted counts as muted.
+        If the player was chosen automatically and works, also record its name. A sentence that was ever muted counts as
+        muted.
         """
         if player.proven and self._configure.player is None:
             self.last_player = player.name

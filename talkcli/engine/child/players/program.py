@@ -116,10 +116,9 @@ class PlayerProcess:
     def poll(self) -> int | None:
         """Return the exit status, or None while the program runs.
 
-        After its exit, kill all processes that it started.
-
-        This also reaps the program. If a signal killed it, the status is the negative number of the signal. The program
-        counts as running until all processes that it has started have exited.
+        After its exit, kill all processes that it started. This also reaps the program. If a signal killed it, the
+        status is the negative number of the signal. The program counts as running until all processes that it has
+        started have exited.
         """
         if self._status is None:
             if hasattr(os, "waitid"):  # missing on macOS before Python 3.13

@@ -111,8 +111,8 @@ class Synthesizer(Protocol):
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
         """Synthesize a sentence, and write it to the sink.
 
-        The sample rate comes first, and every word is reported before its first sample is written. The times of words
-        never decrease, but their positions in the text may jump back and repeat.
+        Return after writing all of it. The sample rate comes first, and every word is reported before its first sample
+        is written. The times of words never decrease, but their positions in the text may jump back and repeat.
 
         Samples are written in small parts as soon as they are ready, because a sentence can only be stopped or paused
         while the sink is called. If the next part takes more than a few milliseconds, the synthesizer calls `write`

@@ -47,9 +47,8 @@ class CombinedSynthesizer:
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
         """Speak a text with the current voice.
 
-        If a neural voice can't be used, speak with libespeak-ng.
-
-        The error is raised instead if `settings.voice_only` is set, or if samples have already been written.
+        If a neural voice can't be used, speak with libespeak-ng. The error is raised instead if `settings.voice_only`
+        is set, or if samples have already been written.
         """
         neural = self._neural
         if neural is None or self._current is not neural or settings.voice_only:

@@ -90,10 +90,9 @@ def _events_of(pointer: Any) -> Iterator[_EspeakEvent]:
 def load_library() -> tuple[Any, str, int]:
     """Load and initialize libespeak-ng.
 
-    Return pyttsx3's binding, the version and the sample rate.
-
-    The library of the system is preferred. If it is missing, the library from the package espeakng-loader is used. Call
-    this once per process, before anything imports `pyttsx3.drivers._espeak`, which also loads the library.
+    Return pyttsx3's binding, the version and the sample rate. The library of the system is preferred. If it is missing,
+    the library from the package espeakng-loader is used. Call this once per process, before anything imports
+    `pyttsx3.drivers._espeak`, which also loads the library.
 
     Returns:
         pyttsx3's binding, the name and version of the library to show to users ("eSpeak NG 1.51 (system)"), and the

@@ -100,7 +100,7 @@ def guarded(text: str, voice: str = "") -> str:
         text = _unsafe_characters(language).sub(" ", text)
     if language in _UNSAFE_DIGIT_COUNTS:
         text = _SPOKEN_NUMBER.sub(lambda found: _split_number(found[0], *_UNSAFE_DIGIT_COUNTS[language]), text)
-    return _WORD_OR_GAP.sub(_split_word, _without_leading_hyphens(_without_long_initials(text)))
+    return _WORD_OR_GAP.sub(_split_word, _blank_crashing_hyphens(_without_long_initials(text)))
 
 
 def _unsafe_characters(language: str) -> re.Pattern[str]:
@@ -178,8 +178,8 @@ def _max_bytes(character: str) -> int:
     return max(2, _utf8_bytes(character), _utf8_bytes(character.lower()))
 
 
-def _without_leading_hyphens(text: str) -> str:
-    """Replace hyphens that follow only symbols in their clause with blanks.
+def _blank_crashing_hyphens(text: str) -> str:
+    """Replace the hyphens that would crash the library with blanks.
 
     The library doesn't mark the beginning of the word after such a hyphen. Later, it looks for the mark and reads
     beyond the start of its list of phonemes. This crashes Vietnamese, Danish, Hindi and other voices.

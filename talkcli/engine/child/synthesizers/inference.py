@@ -315,9 +315,8 @@ class Model:
 def load_libraries(path: str) -> None:
     """Import numpy and onnxruntime.
 
-    Error messages name the `path` of the model that needs them.
-
-    This takes 0.25 s, and blocks all other threads for a tenth of that time.
+    Error messages name the `path` of the model that needs them. This takes 0.25 s, and blocks all other threads for a
+    tenth of that time.
 
     Raises:
         VoiceFileError: The packages can't be imported, or there is not enough memory.

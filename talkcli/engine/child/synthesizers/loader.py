@@ -156,9 +156,8 @@ class ModelLoader:
     def start(self, voice: str) -> None:
         """Load a voice in the background.
 
-        If it is already loaded, add a `VoiceLoaded` event at once.
-
-        When the load begins, any earlier error of the voice is forgotten.
+        If it is already loaded, add a `VoiceLoaded` event at once. When the load begins, any earlier error of the voice
+        is forgotten.
         """
         if voice in self._models:
             self._events.append(VoiceLoaded(voice, 0.0))
@@ -170,9 +169,7 @@ class ModelLoader:
     def get_model(self, voice: str) -> Model | None:
         """Return the model of a voice, or None if it isn't loaded.
 
-        Unload a failed voice whose files have changed.
-
-        If the thread of a load is done, finish the load first.
+        Unload a failed voice whose files have changed. If the thread of a load is done, finish the load first.
         """
         self._finish_load()
         model, fingerprints = self._models.get(voice, (None, ()))
@@ -227,7 +224,7 @@ class ModelLoader:
         self._start_next_load()
 
     def _measure_memory(self, voice: str, min_growth: float = -math.inf) -> None:
-        """Record an event about the growth of the process's memory.
+        """Record an event with the memory that all voices use, and the voice because of which it is measured.
 
         If the growth since the last event is below `min_growth` bytes, record nothing unless a voice was unloaded.
         """

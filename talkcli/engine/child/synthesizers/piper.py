@@ -277,10 +277,8 @@ def _to_bytes(samples: Any, volume: float) -> bytes:
 def _phoneme_ids(phonemes: Sequence[str], ids: Mapping[str, tuple[int, ...]]) -> tuple[list[int], list[int]]:
     """Convert phonemes to the model's ids.
 
-    Also return the index of each phoneme's first id.
-
-    If the model doesn't know a phoneme, it gets the index of the next known phoneme, or of the end. If the model knows
-    none of them, the list of indexes is empty.
+    Also return the index of each phoneme's first id. If the model doesn't know a phoneme, it gets the index of the next
+    known phoneme, or of the end. If the model knows none of them, the list of indexes is empty.
     """
     result = [*ids[BEGIN_SYMBOL], *ids[PAD_SYMBOL]]
     places = []
