@@ -70,7 +70,7 @@ _FAINT_VOLUME = 0.2
 
 @frozen
 class SocketPlace:
-    """What was found at a path where a server may listen."""
+    """The result of examining a path at which a server may listen."""
 
     path: str
     #: one of the PLACE texts, or the system's error message
@@ -114,7 +114,7 @@ def _find_refusal(error: TalkError, places: list[SocketPlace]) -> str | None:
 
 
 def _probe_path(path: str, trusted: Container[str | None]) -> SocketPlace:
-    """Find out what is at a path by connecting to it."""
+    """Examine a path by connecting to it."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
@@ -187,7 +187,7 @@ def explain_missing_server(places: list[SocketPlace], named_by: str | None, erro
 
 
 def _format_place(place: SocketPlace) -> str:
-    """Describe a path and what was found there."""
+    """Describe a path and the result of examining it."""
     whose = "" if place.uid is None or place.what not in {PLACE_FOREIGN, PLACE_FORBIDDEN} else f" (uid {place.uid})"
     return f"{place.path}: {place.what}{whose}"
 

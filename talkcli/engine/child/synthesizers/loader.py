@@ -224,7 +224,7 @@ class ModelLoader:
         self._start_next_load()
 
     def _measure_memory(self, voice: str, min_growth: float = -math.inf) -> None:
-        """Record an event with the memory that all voices use, and the voice because of which it is measured.
+        """Record an event with the memory of all voices, measured after this voice was loaded or used.
 
         If the growth since the last event is below `min_growth` bytes, record nothing unless a voice was unloaded.
         """
