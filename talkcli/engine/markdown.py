@@ -115,7 +115,7 @@ class MarkdownReader:
         self._last = ""
 
     def read(self, text: str, *, ended: bool = False) -> str:
-        """Add text, and return what can be spoken of it and of earlier text.
+        """Add text, and return the text that is newly readable, with blanks in place of marks.
 
         With `ended`, return the whole rest.
         """
@@ -125,7 +125,7 @@ class MarkdownReader:
         self._known = partial.start() if partial and not ended else len(self._text)
         found: list[str] = []
         while self._at < len(self._text):
-            step = self._read_block() if self._fence else self._step() if self._kind else self._begin_line("")
+            step = self._read_code_line() if self._fence else self._read_token() if self._kind else self._begin_line("")
             if step is None:
                 break
             self._at += len(step)
@@ -133,8 +133,8 @@ class MarkdownReader:
             self._last = step.rstrip()[-1:] or self._last
         return "".join(found)
 
-    def _step(self) -> str | None:
-        """Return the next token without its marks, or the text before it.
+    def _read_token(self) -> str | None:
+        """Return the text before the next token, or the token without its marks.
 
         Return None if more text is needed.
         """
@@ -185,11 +185,8 @@ class MarkdownReader:
             newline = _SENTENCE_PAUSE
         return newline + marks
 
-    def _read_block(self) -> str | None:
-        """Return blanks for a line in a code block.
-
-        Leave the code block at its end.
-        """
+    def _read_code_line(self) -> str | None:
+        """Return blanks for a line of a code block, and leave the block after its last line."""
         text, at = self._text, self._at
         end = text.find("\n", at)
         line = text[at : end if end >= 0 else len(text)]
@@ -229,7 +226,7 @@ class MarkdownReader:
         return " " * len(mark)
 
     def _read_mark(self, kind: str, token: re.Match[str]) -> str:
-        """Return the replacement for any other token."""
+        """Return a token that begins neither a line nor a span, with its marks blanked."""
         text, (start, end), mark = self._text, token.span(), token.group()
         before, after = text[start - 1 : start] or "\n", text[end : end + 1] or "\n"
         kept = 0  # number of characters at the end of the token that aren't marks

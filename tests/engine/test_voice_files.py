@@ -130,9 +130,9 @@ def test_a_file_that_anyone_can_write_is_refused(home: Path, where: str) -> None
     with pytest.raises(
         VoiceFileError, match=f"^{wrong} can be changed by other users, .*; fix it with: chmod go-w {wrong}$"
     ):
-        open_checked(str(json_path(path)), model=str(path))
+        open_checked(str(json_path(path)), model_path=str(path))
     wrong.chmod(0o755)
-    open_checked(str(json_path(path)), model=str(path)).close()
+    open_checked(str(json_path(path)), model_path=str(path)).close()
 
 
 def test_the_error_names_all_unsafe_paths_and_one_command_to_fix_them(home: Path) -> None:

@@ -335,7 +335,7 @@ def find_lost_text(text: str, pieces: Iterable[str], source: random.Random) -> s
         growing.append(piece, now)
         growing.ended = not piece
         now += source.choice((0.0, 0.01, 0.11, 1.1))
-        while (part := growing.next_part(now, source.choice((0.0, 0.1, 5.0)))) is not None:
+        while (part := growing.take_next_part(now, source.choice((0.0, 0.1, 5.0)))) is not None:
             parts.append(text[slice(*part)])
     return None if "".join("".join(parts).split()) == "".join(text.split()) else f"other parts: {parts}"
 

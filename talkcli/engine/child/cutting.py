@@ -22,8 +22,8 @@ _LOW_BUFFER_S = 0.15
 _CLAUSE_CHARS, _PART_CHARS = 12, 300
 #: Length in which the longest abbreviation is found.
 _ABBREVIATION_CHARS = 24
-#: How long the text must not change before a stop counts as the end of a sentence.
-_NOTHING, _QUIET, _LONG_QUIET, _NEVER = range(4)
+#: How long the text must not change before a stop counts as the end of a sentence. `_NEVER` means that it is no end.
+_NO_WAIT, _SHORT_WAIT, _LONG_WAIT, _NEVER = range(4)
 
 _CLOSERS = r"[\"'”’“‘»«›‹)\]}*_~`」』）】》]*"
 _WIDE_CLOSERS = r"[\"'”’」』）】》]*"
@@ -110,7 +110,7 @@ class GrowingText:
 
     @property
     def finished(self) -> bool:
-        """Whether the text has ended and all of it was passed on."""
+        """Whether the text has ended and all of it was passed to the synthesizer."""
         return self.ended and not self.text[self._position :].strip()
 
     def append(self, text: str, now: float) -> None:
@@ -129,43 +129,43 @@ class GrowingText:
         Text that was already passed on stays.
         """
         position = self._position
-        while (end := self._find_sentence_end(_LONG_QUIET)) is not None:
+        while (end := self._find_sentence_end(_LONG_WAIT)) is not None:
             self._position = end
         self.text, self._position, self.ended = self.text[: self._position], position, True
 
-    def next_part(self, now: float, buffered: float) -> tuple[int, int] | None:
-        """Return the start and end of the next part, and move the position behind it.
+    def take_next_part(self, now: float, buffered_s: float) -> tuple[int, int] | None:
+        """Advance past the next part, and return its offsets, or None if it is too early to cut.
 
         A text that has ended is one part. Blanks between parts are skipped.
 
         Args:
             now: the current time.
-            buffered: the remaining sound of the player in seconds, 0 if it is silent.
+            buffered_s: the remaining sound of the player in seconds, 0 if it is silent.
 
         Returns:
-            offsets in the text. None if it is too early to cut or nothing is left.
+            the start and end of the part in the text. None if it is too early to cut or nothing is left.
         """
-        end = self._find_end(now, now + buffered)
+        end = self._find_part_end(now, now + buffered_s)
         if end is None:
             return None
         start, self._position = self._position, end
         return start, end
 
-    def due(self, now: float, buffered: float) -> float:
-        """Return the time at which there is a next part even if no text is added.
+    def next_part_at(self, now: float, buffered_s: float) -> float:
+        """Return the time at which the next part can be cut if no more text is added.
 
-        Return infinity if only more text can complete a part.
+        Return infinity if only more text can complete a part. `buffered_s` is the remaining sound of the player.
         """
-        silent_at = now + buffered
+        silent_at = now + buffered_s
         changed_at = self._changed_at if self._changed_at is not None else now
         times = (changed_at + _QUIET_S, silent_at - _LOW_BUFFER_S, max(changed_at + _LONG_QUIET_S, silent_at))
         for time in (now, *sorted(each for each in times if each > now)):
-            if self._find_end(time, silent_at) is not None:
+            if self._find_part_end(time, silent_at) is not None:
                 return time
         return float("inf")
 
-    def _find_end(self, now: float, silent_at: float) -> int | None:
-        """Return the end of the next part, if the text can be cut now.
+    def _find_part_end(self, now: float, silent_at: float) -> int | None:
+        """Skip blanks, and return the end of the next part, or None if it is too early to cut.
 
         Args:
             now: the current time.
@@ -179,30 +179,30 @@ class GrowingText:
             return len(text) if start < len(text) else None
         if self._changed_at is None:
             self._changed_at = now
-        passed = _QUIET if now >= self._changed_at + _QUIET_S else _NOTHING
+        waited = _SHORT_WAIT if now >= self._changed_at + _QUIET_S else _NO_WAIT
         if now >= max(self._changed_at + _LONG_QUIET_S, silent_at):
-            passed = _LONG_QUIET
+            waited = _LONG_WAIT
         longest = start + _PART_CHARS
-        end = self._find_sentence_end(passed)
+        end = self._find_sentence_end(waited)
         if end is not None and end <= longest:
             return end
         if now >= silent_at - _LOW_BUFFER_S:
             clause = _CLAUSE_END.search(text, start + _CLAUSE_CHARS - 1)
-            if clause and clause.end() <= longest and (clause.end() < len(text) or passed):
+            if clause and clause.end() <= longest and (clause.end() < len(text) or waited):
                 return clause.end()
         if len(text) > longest:
             return _find_break(text, start, longest)
-        return _find_gap(text, start, longest) if passed == _LONG_QUIET else None
+        return _find_gap(text, start, longest) if waited == _LONG_WAIT else None
 
-    def _find_sentence_end(self, passed: int) -> int | None:
-        """Return the end of the first sentence after the position, if it is known.
+    def _find_sentence_end(self, waited: int) -> int | None:
+        """Return the end of the next sentence, or None if the text may still go on.
 
-        `passed` says how long the text has not changed.
+        `waited` says how long the text has not changed, as one of the constants such as `_SHORT_WAIT`.
         """
         for found in _SENTENCE_END.finditer(self.text, max(self._position, self._searched)):
             self._searched = found.start()
-            needed = _judge(self.text, self._position, found)
-            if needed <= passed:
+            needed = _wait_at_stop(self.text, self._position, found)
+            if needed <= waited:
                 return found.start() if "\n" in found.group() else found.end()
             if needed < _NEVER:
                 return None
@@ -210,58 +210,58 @@ class GrowingText:
         return None
 
 
-def _judge(text: str, start: int, found: re.Match[str]) -> int:
-    """Return how long to wait before a sentence may end at this stop.
+def _wait_at_stop(text: str, start: int, stop: re.Match[str]) -> int:
+    """Return how long to wait for more text before the sentence may end at this stop.
 
-    The sentence begins at `start`.
+    The sentence begins at `start`. The result is one of the constants such as `_SHORT_WAIT`.
     """
-    kind, end = found.lastgroup, found.end()
+    kind, end = stop.lastgroup, stop.end()
     sentence = text[start:end]
     if not re.search(r"\w", sentence[:_PART_CHARS]):
         return _NEVER
-    if "\n" in found.group():
-        return _NOTHING if kind == "line" else _LONG_QUIET
+    if "\n" in stop.group():
+        return _NO_WAIT if kind == "line" else _LONG_WAIT
     if kind == "wide_stop":
         is_quoted = len(re.findall("[“「『（]", sentence)) > len(re.findall("[”」』）]", sentence))
-        return _QUIET if is_quoted and end == len(text) else _NOTHING
+        return _SHORT_WAIT if is_quoted and end == len(text) else _NO_WAIT
     following = len(text) - len(text[end:].lstrip(_LEAD))
     if text[following : following + 1].islower():
         return _NEVER
-    dot = found.start()
+    dot = stop.start()
     abbreviation = _ABBREVIATION.search(text[max(start, dot - _ABBREVIATION_CHARS) : dot + 2])
     if abbreviation:
-        return _judge_abbreviation(text, following, str(abbreviation.lastgroup))
-    return _NOTHING if following < len(text) else _QUIET
+        return _wait_after_abbreviation(text, following, str(abbreviation.lastgroup))
+    return _NO_WAIT if following < len(text) else _SHORT_WAIT
 
 
-def _judge_abbreviation(text: str, following: int, kind: str) -> int:
-    """Return how long to wait before a sentence may end after an abbreviation or a number.
+def _wait_after_abbreviation(text: str, following: int, kind: str) -> int:
+    """Return how long to wait for more text before a sentence may end at an abbreviation.
 
-    `following` is the offset of the text after it.
+    `following` is the offset of the text after it, and `kind` is the name of its group in `_ABBREVIATION`.
     """
     if kind == "never":
         return _NEVER
     if _LAST_WORD.match(text, following):
-        return _LONG_QUIET
-    return _NEVER if _REST[kind].match(text, following) else _NOTHING
+        return _LONG_WAIT
+    return _NEVER if _REST[kind].match(text, following) else _NO_WAIT
 
 
-def _find_gap(text: str, start: int, longest: int) -> int | None:
-    """Return the offset of the last gap between words.
+def _find_gap(text: str, start: int, limit: int) -> int | None:
+    """Return the offset of the last gap between words before `limit`, or None.
 
-    Return None if the words before it are too short.
+    The words before the gap must not be too short.
     """
-    gaps = [each.start() for each in _GAP.finditer(text, start + _CLAUSE_CHARS, longest + 1)]
+    gaps = [each.start() for each in _GAP.finditer(text, start + _CLAUSE_CHARS, limit + 1)]
     return gaps[-1] if gaps else None
 
 
-def _find_break(text: str, start: int, longest: int) -> int:
-    """Return the best place to break a sentence that is too long."""
-    found = _CLAUSE_END.finditer(text, start + _CLAUSE_CHARS - 1, longest)
-    clauses = [each.end() for each in found if each.end() < longest]
-    place = clauses[-1] if clauses else _find_gap(text, start, longest)
+def _find_break(text: str, start: int, limit: int) -> int:
+    """Return the best offset before `limit` at which to break a sentence that is too long."""
+    found = _CLAUSE_END.finditer(text, start + _CLAUSE_CHARS - 1, limit)
+    clauses = [each.end() for each in found if each.end() < limit]
+    place = clauses[-1] if clauses else _find_gap(text, start, limit)
     if place is None:
-        place = next((at for at in range(longest, start, -1) if _may_separate(text[at - 1], text[at])), longest)
+        place = next((at for at in range(limit, start, -1) if _may_separate(text[at - 1], text[at])), limit)
     return place
 
 

@@ -52,7 +52,7 @@ class CannotStart(Exception):
 
 
 def start(configure: protocol.Configure, runner: GoalRunner) -> protocol.Ready:
-    """Start pyttsx3's engine, and attach it to the runner.
+    """Start pyttsx3's engine, attach it to the runner, and return the `Ready` message.
 
     Raises:
         CannotStart: a driver, a voice or a library is missing or unknown.
@@ -79,7 +79,7 @@ def start(configure: protocol.Configure, runner: GoalRunner) -> protocol.Ready:
 
 
 def _register_own_driver(synthesizer_name: str, driver_name: str, runner: GoalRunner) -> CombinedSynthesizer:
-    """Create one of `talk`'s synthesizers, and register a driver for it.
+    """Create and return one of `talk`'s synthesizers, and register a pyttsx3 driver for it.
 
     Raises:
         CannotStart: a library or the default voice is missing.
@@ -104,7 +104,7 @@ def register_driver(name: str, synthesizer: Synthesizer, runner: GoalRunner) -> 
 
 
 def _start_engine(pyttsx3: Any, name: str, *, user_chosen: bool) -> Any:
-    """Start a pyttsx3 engine with this driver.
+    """Start and return a pyttsx3 engine with this driver.
 
     If the user has chosen the driver, a wrong name is a usage error.
 
@@ -171,11 +171,10 @@ class DriverProperties:
         engine.connect("error", self._record_error)
 
     def apply(self, command: protocol.Speak) -> str | None:
-        """Set the properties for a goal.
+        """Set the properties for a goal, and return the reason if another voice is used.
 
-        Return the reason if another voice had to be used, otherwise None. A neural voice may have disappeared since the
-        goal was accepted. The driver then falls back to another of its voices, preferably in the same language. It
-        doesn't do so if `voice_only` is set.
+        A neural voice may have disappeared since the goal was accepted. The driver then falls back to another of its
+        voices, preferably in the same language. It doesn't do so if `voice_only` is set.
 
         Returns:
             The reason for the fallback, or None if the goal has the requested voice.
@@ -202,7 +201,7 @@ class DriverProperties:
         return fallback_reason
 
     def set_voice(self, wanted: str | None) -> None:
-        """Set the voice that best matches a name, or the default voice.
+        """Set the voice that best matches a name. None selects the default voice.
 
         Raises:
             CannotSpeak: there is no such voice.
@@ -232,11 +231,11 @@ class DriverProperties:
             raise CannotSpeak(Reason.UNKNOWN_VOICE, voices.unknown_voice_message(wanted, self._voices, foreign))
         return found.id
 
-    def _set_property(self, name: str, value: Any, setting: str) -> None:
+    def _set_property(self, name: str, value: Any, label: str) -> None:
         """Set a property of the engine, or raise CannotSpeak.
 
         pyttsx3 reports errors through notifications. This method raises them as exceptions. In the messages,
-        `setting` names the property and its value.
+        `label` names the property and its value.
 
         Raises:
             CannotSpeak: the property can't be set.
@@ -249,7 +248,7 @@ class DriverProperties:
             raise CannotSpeak(Reason.UNKNOWN_VOICE, message) from error
         if error is not None:
             why = str(error.args[0] if error.args else error) or type(error).__name__
-            raise CannotSpeak(Reason.BAD_OPTION, f"the driver {self._driver} cannot set {setting}: {why}") from error
+            raise CannotSpeak(Reason.BAD_OPTION, f"the driver {self._driver} cannot set {label}: {why}") from error
 
     def _record_error(self, exception: Exception, **_: object) -> None:
         """Store an error from pyttsx3 for `_set_property` to raise."""
@@ -314,9 +313,7 @@ class Driver:
         return self._synthesizer.voice if name == "voice" else fields(self._sound)[name]
 
     def setProperty(self, name: str, value: Any) -> None:  # noqa: N802 - pyttsx3's name
-        """Load a voice if the property is "voice".
-
-        Otherwise, change a setting for the next sentences.
+        """Load a voice, or change a setting for the next sentences.
 
         Raises:
             KeyError: the property is unknown.
@@ -329,7 +326,7 @@ class Driver:
             self._sound = replace(self._sound, **{name: kind(value)})
 
     def _speak(self, text: str) -> None:
-        """Speak a text, and notify pyttsx3 of each step."""
+        """Speak a text, notify pyttsx3 of each step, and store the results in the runner."""
         runner = self._runner
         self._proxy.notify("started-utterance")
         self._playback = playback = Playback(runner, self._notify_word)
@@ -351,9 +348,7 @@ class Driver:
         self._proxy.notify("finished-utterance", completed=runner.duration is not None)
 
     def _parts(self, text: str, playback: Playback) -> Iterator[tuple[str, bool]]:
-        """Yield the parts of a text as soon as they can be spoken.
-
-        Also yield whether a part is the last one.
+        """Yield each part of a text once it can be spoken, and whether it is the last one.
 
         A text that doesn't grow is a single part. While text is missing, the playback continues.
         """
@@ -363,7 +358,7 @@ class Driver:
             return
         while True:
             now, buffered = time.monotonic(), playback.buffered()
-            part = growing.next_part(now, buffered)
+            part = growing.take_next_part(now, buffered)
             if part is not None:
                 self._runner.report_text_missing(False)
                 playback.begin_part(part[0], is_last=growing.finished)
@@ -372,9 +367,9 @@ class Driver:
                 return
             else:
                 self._runner.report_text_missing(buffered <= 0)
-                playback.await_text(min(growing.due(now, buffered), now + buffered if buffered > 0 else NEVER))
+                playback.await_text(min(growing.next_part_at(now, buffered), now + buffered if buffered > 0 else NEVER))
 
     def _notify_word(self, word: TimedWord) -> None:
-        """Notify pyttsx3 that a word is being heard."""
+        """Store a word's position in the audio in the runner, and notify pyttsx3 of the word."""
         self._runner.position = word.position
         self._proxy.notify("started-word", location=word.location, length=word.length)

@@ -164,7 +164,7 @@ class PlayerFeed:
         clock.reset(begin)
 
     def offer(self, samples: memoryview) -> int:
-        """Offer samples to the player, and return the number of bytes accepted.
+        """Offer samples to the player, update the timing, and return the number of bytes accepted.
 
         The first samples start the clock.
         """
@@ -179,22 +179,22 @@ class PlayerFeed:
             self._heard_at = now + self.buffered(now)
         return taken
 
-    def offer_silence(self, position: float, limit: int | None = None) -> int:
-        """Offer silence to the player, and return the number of bytes accepted.
+    def offer_silence(self, position: float, max_bytes: int | None = None) -> int:
+        """Offer silence before a position in the audio, and return the number of bytes accepted.
 
         Args:
-            position: position in the audio of the next sample.
-            limit: maximum number of bytes to offer, or None for a whole piece.
+            position: position in the audio of the next sample, in seconds.
+            max_bytes: maximum number of bytes to offer, or None for a whole piece.
         """
-        taken = self.offer(memoryview(bytes(self.piece_bytes))[:limit])
+        taken = self.offer(memoryview(bytes(self.piece_bytes))[:max_bytes])
         if taken:
             self._clock.add_silence(position, self._seconds(taken))
         return taken
 
-    def update(self, now: float, *, complete: bool) -> None:
+    def update(self, now: float, *, all_written: bool) -> None:
         """Adjust the clock to the player's progress.
 
-        Set `complete` if nothing more will be written.
+        Set `all_written` if nothing more will be written.
         """
         consumed = self.player.consumed()
         if consumed > self.consumed:
@@ -206,7 +206,7 @@ class PlayerFeed:
         heard = self.player.heard()
         if heard is not None:
             self._clock.set_elapsed(now, heard)
-        elif self.player.real_time and not (complete and consumed >= self.written):
+        elif self.player.real_time and not (all_written and consumed >= self.written):
             self._clock.limit_elapsed(now, max(0.0, self._seconds(consumed) - MIN_PLAYER_BUFFER_S))
 
     def buffered(self, now: float) -> float:
@@ -294,9 +294,10 @@ class Playback:
     # -- methods for the synthesizer
 
     def begin(self, rate: int, voice: str, fallback_reason: str | None = None) -> None:
-        """Set the sample rate, report the voice, and start a player if it plays in real time and may play now.
+        """Set the sample rate, report the voice, and start a player unless speech is paused.
 
-        The player starts in 1 to 15 ms, while the synthesizer produces the first samples. `write` raises its errors.
+        A player that writes to a file is started later. Another player starts in 1 to 15 ms, while the synthesizer
+        produces the first samples. `write` raises its errors.
 
         Args:
             rate: samples per second.
@@ -327,7 +328,7 @@ class Playback:
         self._clock.add(TimedWord(self._part_start + start, length, self._seconds(self._part_begin) + position))
 
     def write(self, samples: bytes) -> None:
-        """Play samples, and return once the player has accepted them.
+        """Send samples to the player, and wait until it has accepted them. Hold back silence.
 
         If all samples so far are silent, they are stored until the first sound follows.
         """
@@ -352,7 +353,7 @@ class Playback:
     # -- methods for the driver
 
     def begin_part(self, start: int, *, is_last: bool) -> None:
-        """Continue with the part of the text that begins at this offset."""
+        """Record that the next samples belong to the part of the text that begins at `start`."""
         self._part_start, self._part_begin, self._part_follows = start, self._samples.end, not is_last
 
     def buffered(self) -> float:
@@ -432,7 +433,7 @@ class Playback:
     # -- choosing a player
 
     def _with_player(self, step: Callable[[PlayerFeed], None]) -> None:
-        """Call `step` with the current player.
+        """Call `step` with a player, and again with the next player if that one fails.
 
         If the player fails or was released, call `step` with the next player. The call is repeated if the player fails
         before any sound was heard, or was released during a pause.
@@ -485,10 +486,7 @@ class Playback:
             self._wait(until=time.monotonic() + DEVICE_RETRY_INTERVAL_S)
 
     def _may_retry_busy_device(self, error: CannotSpeak) -> bool:
-        """Return whether the device is busy and may be tried again.
-
-        The first call starts the time limit.
-        """
+        """Return whether to retry a busy device. The first call starts the time limit."""
         if error.reason != Reason.AUDIO_DEVICE or "busy" not in str(error).lower():
             return False
         self._busy_until = self._busy_until or time.monotonic() + DEVICE_BUSY_LIMIT_S
@@ -501,20 +499,14 @@ class Playback:
         self.silence()
 
     def _release_and_rewind(self, feed: PlayerFeed) -> None:
-        """Release a player that still has sound in its buffer.
-
-        The next player repeats the unheard sound.
-        """
-        feed.update(time.monotonic(), complete=False)
+        """Kill a player, so that the next one repeats the sound that was not heard."""
+        feed.update(time.monotonic(), all_written=False)
         self._replace_player(self._unheard_begin() if feed.player.proven else self._begin)
 
     # -- steps
 
     def _send_all(self, feed: PlayerFeed) -> None:
-        """Send the player all samples up to `_sendable_end`.
-
-        Play silence while the sentence is paused.
-        """
+        """Send the player all samples except held-back silence. Play silence while paused."""
         if feed.written == 0:
             feed.progress_at = time.monotonic()  # until now, the player had nothing to play
         while True:
@@ -533,14 +525,14 @@ class Playback:
             if time.monotonic() >= due and not self._runner.hold_number and not self._offer_next(feed):
                 raise CannotSpeak(Reason.AUDIO_STALLED, f"{feed.player.name} accepted no sound for {limit:g} s")
 
-    def _await_samples(self, feed: PlayerFeed, more: Sequence[Interest] = (), until: float = NEVER) -> None:
-        """Keep playing until a descriptor in `more` is ready, time is up or the player needs attention."""
+    def _await_samples(self, feed: PlayerFeed, interests: Sequence[Interest] = (), until: float = NEVER) -> None:
+        """Keep playing until a descriptor is ready, time is up or the player needs attention."""
         if self._runner.hold_number:
             self._keep_silent(feed)
         feed.player.ended()  # check for a failure here, because the wait below doesn't report it
         if self._sent < self._sendable_end(feed):
             self._offer_next(feed)
-        self._wait_for_player(feed, until, more, has_samples=self._sent < self._sendable_end(feed))
+        self._wait_for_player(feed, until, interests, has_samples=self._sent < self._sendable_end(feed))
         self._update_progress(feed)
         feed.progress_at = time.monotonic()  # until now, the player had nothing to play
 
@@ -569,11 +561,10 @@ class Playback:
     # -- samples
 
     def _skip_leading_zeros(self) -> bool:
-        """Decide how many leading zero samples to skip.
+        """Skip silence before the first sound, or return False if it is too early to decide.
 
-        Return False if it is too early to decide. Zeros before the first sound are skipped, so that it is heard
-        earlier. They are kept in a file. They are also kept after another sentence, because they are part of the
-        silence between the two sentences.
+        Zeros before the first sound are skipped, so that it is heard earlier. They are kept in a file. They are also
+        kept after another sentence, because they are part of the silence between the two sentences.
         """
         if self._start_known:
             return True
@@ -589,7 +580,7 @@ class Playback:
         return True
 
     def _offer_next(self, feed: PlayerFeed) -> int:
-        """Offer the next samples to the player, and return the number of bytes accepted."""
+        """Offer initial silence or the next samples, and return the number of bytes accepted."""
         if feed.lead_in:
             taken = feed.offer_silence(self._seconds(self._begin), feed.lead_in)
             feed.lead_in -= taken
@@ -621,10 +612,10 @@ class Playback:
         return max(self._sent, self._samples.end - self._samples.trailing_silence(limit))
 
     def _update_progress(self, feed: PlayerFeed) -> None:
-        """Adjust the clock to the player's progress, and report the words that have started."""
+        """Adjust the clock to the player's progress, drop heard samples, and report started words."""
         now = time.monotonic()
         sent_all = self._complete and self._sent == self._sendable_end(feed)
-        feed.update(now, complete=sent_all and not self._runner.hold_number)
+        feed.update(now, all_written=sent_all and not self._runner.hold_number)
         player = feed.player
         if not player.proven:
             return
@@ -679,9 +670,12 @@ class Playback:
         feed.progress_at = time.monotonic()
 
     def _await_silence(self, feed: PlayerFeed) -> None:
-        """Wait until the player has played its buffer or the sentence continues.
+        """Wait until a paused player is silent. Kill a player that takes too long.
 
-        Replace a player that is too slow.
+        Return early if the sentence continues.
+
+        Raises:
+            _PlayerReleased: the player was killed.
         """
         self._update_progress(feed)
         written, now = feed.written, time.monotonic()
@@ -722,14 +716,14 @@ class Playback:
             self._wait()
 
     def _wait_for_player(
-        self, feed: PlayerFeed, until: float, more: Sequence[Interest] = (), *, has_samples: bool = True
+        self, feed: PlayerFeed, until: float, other_interests: Sequence[Interest] = (), *, has_samples: bool = True
     ) -> None:
         """Wait until the player needs attention, a word is due or time is up.
 
         Args:
             feed: the stream of the player.
             until: the monotonic time.
-            more: further descriptors to wait for.
+            other_interests: further descriptors to wait for.
             has_samples: whether there are samples to write.
         """
         player, now = feed.player, time.monotonic()
@@ -741,13 +735,10 @@ class Playback:
             until = min(until, now + PROGRESS_CHECK_INTERVAL_S)
         # If there are no samples to write, don't wait for a writable player, because that would end the wait at once.
         interests = [each for each in player.interests() if not (idle and each[1] == select.POLLOUT)]
-        self._wait([*interests, *more], until)
+        self._wait([*interests, *other_interests], until)
 
     def _wait(self, interests: Sequence[Interest] = (), until: float = NEVER) -> None:
-        """Let the runner wait and execute commands.
-
-        If the sentence has been stopped, raise Stopped.
-        """
+        """Execute commands while waiting, and raise Stopped if the sentence was stopped."""
         self._runner.wait(interests, until)
         self._raise_if_stopped()
 

@@ -93,11 +93,11 @@ class ActiveGoal:
     def __init__(self, command: protocol.Speak, now: float) -> None:
         self.id = command.id
         self.command = command
-        self._markdown = _markdown_reader() if command.format == MARKDOWN else None
+        self._markdown = _make_markdown_reader() if command.format == MARKDOWN else None
         #: the text without the marks of Markdown. All offsets are the same as in the sender's text.
-        self.text = self._read(command.text, ended=not command.more)
+        self.text = self._remove_markdown(command.text, ended=not command.more)
         #: the text, if it may still grow
-        self.growing_text = _growing_text(self.text, command) if command.more or command.broken else None
+        self.growing_text = _make_growing_text(self.text, command) if command.more or command.broken else None
         self.text_missing = False
         self.words = WordFinder(self.text)
         #: time at which the driver last received text
@@ -130,7 +130,7 @@ class ActiveGoal:
     def append(self, command: protocol.Append, now: float) -> None:
         """Add text to a growing text, or end it."""
         assert self.growing_text
-        text = self._read(command.text, ended=command.end)
+        text = self._remove_markdown(command.text, ended=command.end)
         self.growing_text.append(text, now)
         self.words.append(text)
         if command.broken:
@@ -138,11 +138,8 @@ class ActiveGoal:
         elif command.end:
             self.growing_text.end()
 
-    def _read(self, text: str, *, ended: bool) -> str:
-        """Return what can be spoken of added text and of earlier text.
-
-        Text that is not Markdown is returned unchanged.
-        """
+    def _remove_markdown(self, text: str, *, ended: bool) -> str:
+        """Return the text that is newly readable, without Markdown. Plain text stays unchanged."""
         return self._markdown.read(text, ended=ended) if self._markdown else text
 
     def speech_seconds(self, now: float) -> float:
@@ -168,7 +165,7 @@ class GoalRunner:
         self._goal: ActiveGoal | None = None
         self._engine: Any = None
         self._set_properties: Any = None
-        self._pump: Callable[[], None] | None = None
+        self._step_run_loop: Callable[[], None] | None = None
         self._synthesizer: CombinedSynthesizer | None = None
         #: number of the current pause, or 0; read by the playback, because pyttsx3 has no method for pausing
         self.hold_number = 0
@@ -186,21 +183,22 @@ class GoalRunner:
         self,
         engine: Any,
         set_properties: Callable[[protocol.Speak], str | None],
-        pump: Callable[[], None] | None,
+        step_run_loop: Callable[[], None] | None,
         synthesizer: CombinedSynthesizer | None,
     ) -> None:
-        """Set the pyttsx3 engine that speaks the goals.
+        """Set the pyttsx3 engine that speaks the goals, and subscribe to its notifications.
 
         Args:
             engine: pyttsx3's engine.
             set_properties: sets the engine's properties for a goal. It returns the reason for a fallback voice, or None
                 if the goal has the requested voice. It raises CannotSpeak if the goal can't be spoken.
-            pump: called about 20 times a second while a third-party driver speaks; None for `talk`'s own driver.
+            step_run_loop: called about 20 times a second while a third-party driver speaks, or None for `talk`'s own
+                driver.
             synthesizer: the synthesizer of `talk`'s own driver, or None with a third-party driver.
         """
         self._engine = engine
         self._set_properties = set_properties
-        self._pump = pump
+        self._step_run_loop = step_run_loop
         self._synthesizer = synthesizer
         engine.connect("started-word", _with_traceback(self._report_word))
         engine.connect("finished-utterance", _with_traceback(self._handle_driver_finished))
@@ -226,10 +224,10 @@ class GoalRunner:
                 self._speak(self._goal)
 
     def wait(self, interests: Iterable[Interest] = (), until: float = NEVER) -> None:
-        """Wait for a descriptor, a command or a time limit.
+        """Wait until a descriptor is ready or time is up, and execute any commands that arrive.
 
-        Execute arriving commands, and send events that are due. This method may return early. By then, a command may
-        have stopped or paused the sentence.
+        Also send events that are due. This method may return early. By then, a command may have stopped or paused the
+        sentence.
 
         Args:
             interests: the descriptors, with the poll events to wait for.
@@ -278,7 +276,7 @@ class GoalRunner:
     def _pause(self, goal: ActiveGoal, number: int) -> None:
         """Pause the current goal. A third-party driver is stopped, because it can't be paused."""
         self.hold_number = number
-        if self._pump is not None and goal.with_driver and not goal.interrupted:
+        if self._step_run_loop is not None and goal.with_driver and not goal.interrupted:
             goal.interrupted = True
             self._engine.stop()
 
@@ -351,16 +349,16 @@ class GoalRunner:
             goal.fallback_reason = self._set_properties(goal.command)
         except CannotSpeak as error:
             self._fail_goal(error.reason, str(error))
-        if self._goal is goal and self._pump is not None and goal.command.lead_in:
+        if self._goal is goal and self._step_run_loop is not None and goal.command.lead_in:
             self._fail_goal(Reason.BAD_OPTION, "this driver plays the sound itself, so lead_in can't be used")
-        if self._goal is goal and self._pump is not None and goal.growing_text:
+        if self._goal is goal and self._step_run_loop is not None and goal.growing_text:
             words = "this driver can't speak growing texts; send the text when it is complete"
             self._fail_goal(Reason.BAD_OPTION, words)
         goal.error = None
         while self._goal is goal:
             if goal.with_driver:
                 self._step_driver(goal)
-            elif self._pump is not None and self.hold_number:
+            elif self._step_run_loop is not None and self.hold_number:
                 self.confirm_hold()
                 self.wait()
             else:
@@ -384,7 +382,7 @@ class GoalRunner:
         self._engine.iterate()
         if self._goal is not goal:
             return
-        if self._pump is None:
+        if self._step_run_loop is None:
             self._fail_goal(Reason.ENGINE_FAILED, "the driver dropped the sentence")
         elif goal.error is not None:  # a driver never reports the end of a text if its `say` has failed
             self._engine.stop()
@@ -392,7 +390,7 @@ class GoalRunner:
             self._handle_driver_finished(goal.id, completed=False)
         else:
             self.wait(until=time.monotonic() + DRIVER_STEP_S)
-            self._pump()
+            self._step_run_loop()
 
     def _report_word(self, location: int, length: int, **_: object) -> None:
         """Report the word at a location in the text, unless it was already reported.
@@ -444,14 +442,14 @@ class GoalRunner:
         assert self._goal is not None
         self._report_output()
         goal, self._goal = self._goal, None
-        heard = self.heard if self._pump is None else round(goal.speech_seconds(time.monotonic()), 3)
+        heard = self.heard if self._step_run_loop is None else round(goal.speech_seconds(time.monotonic()), 3)
         gaps = len(self.gaps), round(sum(self.gaps), 3)
         player = self.players.last_player
         ended = protocol.Ended(goal.id, outcome, reason, message, self.duration, *gaps, player, heard)
         self._channel.send(ended)
 
     def _alive_due(self) -> float:
-        """Return when to send the next `Alive`, or NEVER if the process is idle or the driver hangs."""
+        """Return when to send the next heartbeat, or NEVER if the process is idle or hangs."""
         loader = self._synthesizer.loader if self._synthesizer else None
         loading = loader is not None and loader.descriptor is not None
         if not loading and (self._goal is None or self._notice_overdue(self._goal)):
@@ -459,12 +457,11 @@ class GoalRunner:
         return self._channel.sent_at + protocol.ALIVE_INTERVAL_S
 
     def _notice_overdue(self, goal: ActiveGoal) -> bool:
-        """Return whether a third-party driver takes too long for the text.
+        """Return whether a third-party driver takes too long, and log this once for each goal.
 
-        Log this once for each goal. The process then sends no `Alive`, so that the server kills it. There may be no
-        other way to stop the driver.
+        The process then sends no `Alive`, so that the server kills it. There may be no other way to stop the driver.
         """
-        if self._pump is None or not goal.with_driver:
+        if self._step_run_loop is None or not goal.with_driver:
             return False
         words_left = (len(goal.command.text) - goal.last_word) * MAX_WORDS_PER_CHARACTER
         limit = DRIVER_LIMIT_S + words_left * 60 / goal.command.rate
@@ -475,28 +472,25 @@ class GoalRunner:
         return overdue
 
 
-def _markdown_reader() -> MarkdownReader:
-    """Return an object that reads a text in Markdown."""
+def _make_markdown_reader() -> MarkdownReader:
+    """Create a reader for a goal's text in Markdown."""
     from talkcli.engine.markdown import MarkdownReader  # rarely needed, and slow to import
 
     return MarkdownReader()
 
 
-def _growing_text(beginning: str, command: protocol.Speak) -> GrowingText:
-    """Return the text of a growing goal.
-
-    The text may already have broken off.
-    """
+def _make_growing_text(text_so_far: str, command: protocol.Speak) -> GrowingText:
+    """Create a GrowingText, without an incomplete last sentence if the sender broke off."""
     from talkcli.engine.child.cutting import GrowingText  # rarely needed, and slow to import
 
-    text = GrowingText(beginning, ended=False)
+    text = GrowingText(text_so_far, ended=False)
     if command.broken:
         text.drop_incomplete()
     return text
 
 
 def _with_traceback(callback: Callable[..., None]) -> Callable[..., None]:
-    """Wrap a callback so that exceptions print a traceback."""
+    """Return a callback that prints a traceback instead of raising an exception."""
 
     def call(**values: Any) -> None:
         try:

@@ -50,7 +50,7 @@ class WordFinder:
         self._text += text
 
     def find(self, location: int, length: int) -> tuple[int, int, int] | None:
-        """Return the word at a reported location, or None if no new word starts there.
+        """Return the start, end and number of the word at a location, or None if it isn't new.
 
         The first word has number 1.
         """

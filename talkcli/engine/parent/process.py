@@ -133,7 +133,7 @@ class EngineProcess:
             yield event
 
     def read_stderr(self) -> bool:
-        """Read the process's standard error, and return whether it is still open."""
+        """Report new lines from standard error, and return whether it is still open."""
         try:
             data = os.read(self.stderr, 65536)
         except BlockingIOError:
@@ -163,7 +163,7 @@ class EngineProcess:
             kill_holders(self.liveness)
 
     def describe_exit(self) -> str:
-        """End the process, and describe how it exited."""
+        """Kill the process if it still runs, and return a description of how it exited."""
         wait_ready({self.liveness: select.POLLIN}, _EXIT_WAIT_S)  # macOS doesn't report a closed end without POLLIN
         self.kill()  # must happen before the process is reaped, because its group ID may be reused afterwards
         try:

@@ -144,14 +144,14 @@ def split_into_pieces(text: str) -> Iterator[str]:
     yield text[start:]
 
 
-def _speak_all(engine: PrivateEngine, commands: Iterator[protocol.Speak], engine_path: str, path: str) -> float:
+def _speak_all(engine: PrivateEngine, commands: Iterator[protocol.Speak], engine_path: str, shown_path: str) -> float:
     """Render all pieces of the text, and return the length of the audio in seconds.
 
     Args:
         engine: the engine process.
         commands: a `Speak` for each piece.
         engine_path: name of the file in the engine's error messages.
-        path: name of the file in the errors raised here.
+        shown_path: name of the file in the errors raised here.
     """
     ready = engine.wait_for(protocol.Ready)
     if ready.player is None:
@@ -168,33 +168,30 @@ def _speak_all(engine: PrivateEngine, commands: Iterator[protocol.Speak], engine
         elif ended.reason == Reason.NOTHING_TO_SAY:  # a piece of a long text may contain nothing but dots
             silent_end = ended
         else:
-            raise _convert_goal_error(ended, engine_path, path)
+            raise _convert_goal_error(ended, engine_path, shown_path)
     if silent_end and not seconds:
-        raise _convert_goal_error(silent_end, engine_path, path)
+        raise _convert_goal_error(silent_end, engine_path, shown_path)
     return seconds
 
 
-def _convert_engine_error(error: EngineFailed, voice: str | None) -> RenderFailed:
-    """Convert an EngineFailed to a RenderFailed.
-
-    `voice` is the voice that was speaking, or None.
-    """
-    while_speaking = "" if voice is None else f' while it spoke with the voice "{voice}"'
+def _convert_engine_error(error: EngineFailed, speaking_voice: str | None) -> RenderFailed:
+    """Convert an EngineFailed to a RenderFailed that names the voice that was speaking."""
+    while_speaking = "" if speaking_voice is None else f' while it spoke with the voice "{speaking_voice}"'
     if error.reason == Reason.ENGINE_CRASHED:
         return RenderFailed(error.reason, f"the engine crashed{while_speaking}: {error}")
     return RenderFailed(error.reason, f"{error}{while_speaking}")
 
 
-def _convert_goal_error(ended: protocol.Ended, engine_path: str, path: str) -> RenderFailed:
+def _convert_goal_error(ended: protocol.Ended, engine_path: str, shown_path: str) -> RenderFailed:
     """Return an exception for a goal that failed or was stopped.
 
     Its message names the user's file.
     """
     reason = ended.reason or Reason.ENGINE_FAILED
-    message = (ended.message or "the engine stopped before the end of the text").replace(engine_path, path)
+    message = (ended.message or "the engine stopped before the end of the text").replace(engine_path, shown_path)
     if reason in _FILE_REASONS:
-        problem = message.removeprefix(path)
-        return CannotWrite(path, f"cannot be written{problem}" if problem.startswith(": ") else problem.strip())
+        problem = message.removeprefix(shown_path)
+        return CannotWrite(shown_path, f"cannot be written{problem}" if problem.startswith(": ") else problem.strip())
     return RenderFailed(reason, message)
 
 
@@ -224,10 +221,7 @@ def _is_stream(path: str) -> bool:
 
 @contextlib.contextmanager
 def _open_output(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> Iterator[int]:
-    """Open standard output, a pipe or a device in a `with` block.
-
-    Refuse a terminal.
-    """
+    """Open standard output, a pipe or a device in a `with` block. Refuse a terminal."""
     output_fd = os.dup(1) if path in STANDARD_OUTPUT else _open_pipe_or_device(path, deadline, interrupt)
     try:
         if os.isatty(output_fd):
@@ -241,10 +235,7 @@ def _open_output(path: str, deadline: float, interrupt: Mapping[int, int] | None
 
 
 def _open_pipe_or_device(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> int:
-    """Open a device or a named pipe, and return its descriptor.
-
-    Wait until a named pipe has a reader.
-    """
+    """Open a device, or a named pipe once it has a reader, and return the descriptor."""
     while True:
         try:
             return os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
@@ -262,7 +253,7 @@ def _open_pipe_or_device(path: str, deadline: float, interrupt: Mapping[int, int
 
 @contextlib.contextmanager
 def _hidden_file(path: str) -> Iterator[str]:
-    """Create a hidden file that finally replaces the file at `path`.
+    """Create a hidden file, which replaces the file at `path` after the `with` block.
 
     After an error, remove it.
     """
@@ -292,9 +283,7 @@ def _hidden_file(path: str) -> Iterator[str]:
 
 
 def _resolve_target(path: str) -> str:
-    """Return the path of the file to replace, with symbolic links resolved.
-
-    Refuse a path that can't be replaced.
+    """Return the path of the file to replace, with links resolved, or raise CannotWrite.
 
     Raises:
         CannotWrite: the path can't be replaced with a file.

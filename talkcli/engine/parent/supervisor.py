@@ -140,9 +140,9 @@ class RestartPolicy:
             self._back_off(now)
 
     def start_failed(self, now: float, started_at: float, permanent_error: str | None) -> bool:
-        """Schedule the next start after a failed one.
+        """Schedule the next start after a failed one, and return whether goals must fail now.
 
-        Return whether goals have waited too long.
+        That is so if goals have waited too long for an engine.
 
         Args:
             now: the current time.
@@ -222,31 +222,31 @@ class Supervisor:
         """Submit a goal to be spoken. The previous goal must have ended or been given up."""
         self._actions.call(lambda: self._begin_goal(command))
 
-    def append(self, goal_id: str, text: str, *, end: bool, broken: bool) -> None:
-        """Replace the goal's text by a longer one.
+    def append(self, goal_id: str, text: str, *, complete: bool, broke_off: bool) -> None:
+        """Replace the goal's text with a longer one.
 
         Args:
             goal_id: the id of the goal.
             text: all of the text so far.
-            end: whether it is complete.
-            broken: whether it broke off, so that an incomplete sentence at its end isn't spoken.
+            complete: whether no more text follows.
+            broke_off: whether it broke off, so that an incomplete sentence at its end isn't spoken.
         """
-        self._actions.call(lambda: self._append_text(goal_id, text, end=end, broken=broken))
+        self._actions.call(lambda: self._append_text(goal_id, text, complete=complete, broke_off=broke_off))
 
     def stop(self, goal_id: str) -> None:
         """Stop the goal. Its `Ended` is posted once it has stopped."""
         self._actions.call(lambda: self._stop_goal(goal_id))
 
     def pause(self, goal_id: str, number: int) -> None:
-        """Pause the goal.
+        """Pause the goal, and post `Held` with this number once it is silent.
 
-        `Held` is posted once the goal is silent, unless the goal is being stopped.
+        Nothing is posted if the goal is being stopped.
         """
-        self._actions.call(lambda: self._hold_goal(goal_id, number))
+        self._actions.call(lambda: self._pause_or_resume_goal(goal_id, number))
 
     def resume(self, goal_id: str) -> None:
         """Resume a paused goal."""
-        self._actions.call(lambda: self._hold_goal(goal_id, None))
+        self._actions.call(lambda: self._pause_or_resume_goal(goal_id, None))
 
     def announce_next(self, goal_id: str, next_waits: bool, next_is_neural: bool) -> None:
         """Tell the process whether another goal is waiting after the current one.
@@ -311,7 +311,7 @@ class Supervisor:
         for descriptor in ready:
             process = self._watched.get(descriptor)  # None if handling another descriptor has closed this one
             if process:
-                self._handle_ready(process, descriptor)
+                self._handle_readable(process, descriptor)
 
     def _next_deadline(self) -> float:
         """Return the time at which `_handle_deadlines` must be called next."""
@@ -331,7 +331,7 @@ class Supervisor:
             yield self._last_sign_at + HANG_LIMIT_S, f"{no_sign} while loading {self._loading}"
 
     def _handle_deadlines(self, now: float) -> None:
-        """Handle deadlines that have passed, and start a missing process."""
+        """Kill processes that have missed a deadline, and start a new one if it is due."""
         missed = next((message for deadline, message in self._deadlines() if now >= deadline), None)
         if missed:
             self._lose_process(missed, Reason.ENGINE_HUNG)
@@ -344,8 +344,8 @@ class Supervisor:
                 message = f"the player could not be stopped within {KILL_LIMIT_S:g} s"
                 self._fail_goal(self._goal, Reason.NOT_SILENT, message)
 
-    def _handle_ready(self, process: EngineProcess, descriptor: int) -> None:
-        """Handle a readable descriptor of a process."""
+    def _handle_readable(self, process: EngineProcess, descriptor: int) -> None:
+        """Read from a descriptor of a process, or clean up if the process has ended."""
         if descriptor == process.liveness:
             if process is self._process:
                 self._receive(process)  # read the last messages of the process before handling its death
@@ -365,10 +365,7 @@ class Supervisor:
         return self._goal if self._goal and self._goal.command.id == goal_id else None
 
     def _begin_goal(self, command: protocol.GoalCommand) -> None:
-        """Make this the current goal, and send it to the process.
-
-        If no process can start, fail the goal.
-        """
+        """Make this the current goal, and send it, or fail it if no process can start."""
         self._goal = SupervisedGoal(command)
         if self._restarts.permanent_error is not None:
             self._fail_goal(self._goal, Reason.ENGINE_FAILED, self._restarts.permanent_error)
@@ -383,7 +380,7 @@ class Supervisor:
             goal.sent = self._send(goal.command)
 
     def _load_voice(self, voice: str) -> None:
-        """Load a voice.
+        """Tell the process to load a voice, and start the time limit for its next message.
 
         If no process is ready, do nothing, because the server repeats the command to the next one.
         """
@@ -391,10 +388,7 @@ class Supervisor:
             self._loading, self._last_sign_at = voice, time.monotonic()
 
     def _send(self, command: protocol.Command) -> bool:
-        """Send a command if the process is ready, and return whether it was sent.
-
-        Replace a process that refuses it.
-        """
+        """Send a command to a ready process, or kill it if it refuses. Return whether it was sent."""
         process = self._process
         if process is None or not process.ready:
             return False
@@ -405,8 +399,8 @@ class Supervisor:
             self._lose_process("the engine does not accept commands", Reason.ENGINE_HUNG)
         return False
 
-    def _append_text(self, goal_id: str, text: str, *, end: bool, broken: bool) -> None:
-        """Send the process the new part of the text.
+    def _append_text(self, goal_id: str, text: str, *, complete: bool, broke_off: bool) -> None:
+        """Store the goal's longer text, and send the new part to the process.
 
         Keep the whole text, because the goal may have to be sent again.
         """
@@ -414,11 +408,11 @@ class Supervisor:
         if goal is None:
             return
         added = text[len(goal.command.text) :]
-        goal.command = replace(goal.command, text=text, more=not end, broken=broken)
+        goal.command = replace(goal.command, text=text, more=not complete, broken=broke_off)
         if goal.sent:
-            self._send(protocol.Append(goal_id, added, end, broken))
+            self._send(protocol.Append(goal_id, added, complete, broke_off))
 
-    def _hold_goal(self, goal_id: str, number: int | None) -> None:
+    def _pause_or_resume_goal(self, goal_id: str, number: int | None) -> None:
         """Pause the goal, or resume it if `number` is None."""
         goal = self._current_goal(goal_id)
         if goal is None or goal.stop_due != NEVER or goal.end or goal.hold_number == number:
@@ -433,10 +427,7 @@ class Supervisor:
             self._send_waiting_goal()
 
     def _stop_goal(self, goal_id: str) -> None:
-        """Tell the process to stop the goal.
-
-        If the process doesn't have the goal, end it as stopped.
-        """
+        """Tell the process to stop the goal, or end a goal that the process doesn't have."""
         goal = self._current_goal(goal_id)
         if goal is None or goal.stop_due != NEVER:
             return
@@ -500,11 +491,11 @@ class Supervisor:
             self._handle_event(process, event)
 
     def _handle_crash(self, process: EngineProcess) -> None:
-        """Clean up after a process that has crashed, and report how it exited."""
+        """Clean up after a process that has crashed, and post how it exited."""
         self._lose_process(f"the engine crashed: {process.describe_exit()}", Reason.ENGINE_CRASHED)
 
     def _handle_event(self, process: EngineProcess, event: protocol.Event) -> None:
-        """Handle an event from the process."""
+        """Update the state after an event from the process, and pass the event on."""
         self._last_sign_at = time.monotonic()
         if isinstance(event, protocol.GoalEvent):
             goal = self._current_goal(event.id)
@@ -522,7 +513,7 @@ class Supervisor:
         self._send_waiting_goal()
 
     def _handle_goal_event(self, goal: SupervisedGoal, event: protocol.GoalEvent) -> None:
-        """Handle an event about the current goal."""
+        """Update the goal after an event about it, and pass the event on if others need it."""
         if isinstance(event, protocol.Started):
             goal.started = True
         elif isinstance(event, protocol.Ended):
@@ -534,7 +525,7 @@ class Supervisor:
             self._post(event)
 
     def _lose_process(self, message: str, reason: Reason, failure: protocol.StartFailed | None = None) -> None:
-        """Kill the process, and schedule the next start.
+        """Kill the process, retry or end its goal, and schedule the next start.
 
         Args:
             message: a human-readable description of what happened.
@@ -560,7 +551,7 @@ class Supervisor:
             self._handle_failed_start(message, permanent=failure is not None and failure.permanent)
 
     def _handle_lost_goal(self, goal: SupervisedGoal, process: EngineProcess, message: str, reason: Reason) -> None:
-        """Retry or end a goal whose process was killed or has crashed.
+        """Prepare a goal without a process for a retry, or for its end once the process exits.
 
         If the process crashed before it started the goal, nothing was heard, so the goal is sent to the next process.
         Each goal is retried only once.
@@ -577,7 +568,7 @@ class Supervisor:
         goal.sent, goal.stop_due, goal.hold_due = False, NEVER, NEVER
 
     def _handle_failed_start(self, message: str, *, permanent: bool = False) -> None:
-        """Schedule another start.
+        """Schedule another start, and fail the waiting goal if it can't wait longer.
 
         Fail the waiting goal if the error is permanent or the goal has waited too long.
         """

@@ -144,10 +144,9 @@ class PlayerChooser:
         self.handovers.next_waits, self.handovers.next_is_neural = command.next_waits, command.next_is_neural
 
     def update_output(self, player: Player) -> None:
-        """Record the output of a player.
+        """Record a player's output, and its name if it works and was chosen automatically.
 
-        If the player was chosen automatically and works, also record its name. A sentence that was ever muted counts as
-        muted.
+        A sentence that was ever muted counts as muted.
         """
         if player.proven and self._configure.player is None:
             self.last_player = player.name
@@ -172,7 +171,7 @@ class PlayerChooser:
         return milliseconds / 1000 if due else 0.0
 
     def find_first_player(self) -> str | None:
-        """Return the name of the player that would be tried first.
+        """Return the name of the player that would be tried first, or None if there is none.
 
         To test the players that run in this process, open and close them.
         """
@@ -197,11 +196,11 @@ class PlayerChooser:
         return WavStreamPlayer(self._configure.output_fd, rate, first=first)
 
 
-def _open_in_process(name: str, rate: int, device: str | None = None, audible: bool = False) -> Player:
+def _open_in_process(name: str, rate: int, device: str | None = None, fail_if_muted: bool = False) -> Player:
     """Open a player that runs in this process, by its name."""
     module, _, member = PLAYERS[name].class_path.partition(":")
     player_class = getattr(import_module(f"talkcli.engine.child.players.{module}"), member)
-    player: Player = player_class(rate, device, audible)
+    player: Player = player_class(rate, device, fail_if_muted)
     return player
 
 

@@ -114,11 +114,10 @@ class PlayerProcess:
             self.exit = io.FileIO(os.pidfd_open(self.pid))
 
     def poll(self) -> int | None:
-        """Return the exit status, or None while the program runs.
+        """Return the exit status, or None while running. After the exit, kill leftover processes.
 
-        After its exit, kill all processes that it started. This also reaps the program. If a signal killed it, the
-        status is the negative number of the signal. The program counts as running until all processes that it has
-        started have exited.
+        This also reaps the program. If a signal killed it, the status is the negative number of the signal. The program
+        counts as running until all processes that it has started have exited.
         """
         if self._status is None:
             if hasattr(os, "waitid"):  # missing on macOS before Python 3.13
@@ -263,10 +262,7 @@ class ProgramPlayer(Player):
         self._write(memoryview(command.preamble))
 
     def offer(self, data: memoryview) -> int:
-        """Write the samples if the program has read all earlier ones.
-
-        Return the number of bytes written.
-        """
+        """Write samples if the program has read all earlier ones, and return the bytes written."""
         self.ended()  # raises CannotSpeak if the program has exited
         stdin = self._process.stdin
         if stdin.closed:

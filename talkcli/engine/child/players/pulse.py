@@ -225,10 +225,7 @@ class PulsePlayer(Player):
             pass
 
     def _advance_stream(self) -> bool:
-        """Check the stream's state and take the next step.
-
-        Return whether libpulse may have more work now.
-        """
+        """Take the stream's next step, and return whether libpulse may have more work."""
         if self._error is not None or self._drained:
             return False
         state = self._lib.context_get_state(self._context)
@@ -253,10 +250,7 @@ class PulsePlayer(Player):
         return False
 
     def _open_stream(self) -> bool:
-        """Create the stream, and connect it to a sink.
-
-        Return whether libpulse may have more work now.
-        """
+        """Create the stream and connect it to a sink, or return False if it can't be created."""
         buffered, request = (each * self._rate // 1000 * SAMPLE_BYTES for each in (BUFFER_MS, REQUEST_MS))
         # The server starts playing once the buffer is full. If it started with the first piece, it would run out of
         # samples before the second, and would have to rewind. Some sinks can't rewind.
@@ -276,10 +270,7 @@ class PulsePlayer(Player):
         return True
 
     def _follow_sink(self) -> bool:
-        """Respond to a change or suspension of the stream's sink.
-
-        Return whether any requests were sent.
-        """
+        """Respond to a change or suspension of the sink, and return whether requests were sent."""
         index = int(self._lib.stream_get_device_index(self._stream))
         changed = index != self._sink_index
         if changed:

@@ -45,10 +45,9 @@ class CombinedSynthesizer:
         self._current, self.voice = current, current.voice
 
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
-        """Speak a text with the current voice.
+        """Speak a text with the current voice, or with libespeak-ng if a neural voice fails.
 
-        If a neural voice can't be used, speak with libespeak-ng. The error is raised instead if `settings.voice_only`
-        is set, or if samples have already been written.
+        The error is raised instead if `settings.voice_only` is set, or if samples have already been written.
         """
         neural = self._neural
         if neural is None or self._current is not neural or settings.voice_only:

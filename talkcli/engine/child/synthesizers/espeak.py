@@ -88,11 +88,10 @@ def _events_of(pointer: Any) -> Iterator[_EspeakEvent]:
 
 
 def load_library() -> tuple[Any, str, int]:
-    """Load and initialize libespeak-ng.
+    """Initialize libespeak-ng, and return its binding, its version and the sample rate.
 
-    Return pyttsx3's binding, the version and the sample rate. The library of the system is preferred. If it is missing,
-    the library from the package espeakng-loader is used. Call this once per process, before anything imports
-    `pyttsx3.drivers._espeak`, which also loads the library.
+    The library of the system is preferred. If it is missing, the library from the package espeakng-loader is used. Call
+    this once per process, before anything imports `pyttsx3.drivers._espeak`, which also loads the library.
 
     Returns:
         pyttsx3's binding, the name and version of the library to show to users ("eSpeak NG 1.51 (system)"), and the
@@ -121,10 +120,7 @@ def load_library() -> tuple[Any, str, int]:
 
 
 def _preload_library() -> tuple[str, bytes | None]:
-    """Load the library before pyttsx3's binding does.
-
-    Return where it came from, and the directory of its data.
-    """
+    """Load libespeak-ng, and return where it came from and the directory of its data."""
     try:
         ctypes.CDLL(_LIBESPEAK)
         return "system", None
@@ -265,10 +261,10 @@ class Espeak:
         finally:
             phonemizer.end()
 
-    def _find_voice(self, word: str) -> Voice | None:
+    def _find_voice(self, name: str) -> Voice | None:
         """Find a voice by its name or language. Return None if there is none."""
         self._listed = self._listed or _list_voices(self._espeak, None)
-        return find_voice(word, self._listed)
+        return find_voice(name, self._listed)
 
     def _stop_phonemizer(self) -> None:
         """Wait for the last phonemizer to finish, and restore the synthesizer's voice."""
@@ -363,10 +359,7 @@ class EspeakPhonemizer:
             raise Stopped
 
     def _speak_silently(self, text: str) -> tuple[list[tuple[int, int]], int]:
-        """Speak a text without output.
-
-        Return the positions of its words, and the samples in its first clause.
-        """
+        """Return the positions of a text's words, and the number of samples in its first clause."""
         text = guard.guarded(text, self._voice)
         positions: list[tuple[int, int]] = []
         clause_ends: list[int] = []

@@ -86,7 +86,7 @@ _SEPARATE_DIGITS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def guarded(text: str, voice: str = "") -> str:
-    """Replace the characters in a text that would crash libespeak-ng.
+    """Return a text in which the characters that crash libespeak-ng are replaced.
 
     Its length stays the same.
 
@@ -109,16 +109,16 @@ def _unsafe_characters(language: str) -> re.Pattern[str]:
     return re.compile(f"[{''.join(found)}]")
 
 
-def _split_number(number: str, least: int, most: int) -> str:
-    """Split a number in two if it has `least` to `most` digits."""
-    if not least <= sum(map(str.isdigit, number)) <= most:
+def _split_number(number: str, min_digits: int, max_digits: int) -> str:
+    """Split a number with a superscript digit if it has `min_digits` to `max_digits` digits."""
+    if not min_digits <= sum(map(str.isdigit, number)) <= max_digits:
         return number
     middle = next(place for place in range(len(number) // 2, len(number)) if number[place].isdigit())
     return number[:middle] + number[middle].translate(_SEPARATE_DIGITS) + number[middle + 1 :]
 
 
 def _without_long_initials(text: str) -> str:
-    """Replace the dots in long sequences of initials with blanks."""
+    """Return a text in which the dots in long sequences of initials are blanks."""
     result = list(text)
     looked_up = spelled = words = size = 0
     dots: list[int] = []
@@ -195,7 +195,7 @@ def _blank_crashing_hyphens(text: str) -> str:
 
 
 def _split_word(match: re.Match[str]) -> str:
-    """Split the matched word if it is too long for the library.
+    """Return the matched word, changed so that it isn't too long for the library.
 
     Apostrophes become blanks, or pairs of letters get another case.
     """

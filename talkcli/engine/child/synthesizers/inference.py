@@ -97,14 +97,14 @@ class ModelCache:
             os.utime(each)
         return paths
 
-    def store(self, key: str, make_encoder: Callable[[str | None], Any], decoder: Iterable[Buffer]) -> Any:
-        """Create the encoder of a model, and cache both halves if possible.
+    def store(self, key: str, make_encoder: Callable[[str | None], Any], decoder_content: Iterable[Buffer]) -> Any:
+        """Create and return the encoder of a model, and cache both halves if possible.
 
         Args:
             key: The key of the model.
             make_encoder: A function that creates the encoder and writes it to a path. If anything fails, it is called
                 again with None, and then writes nothing.
-            decoder: The content of the decoder's file, in parts.
+            decoder_content: The content of the decoder's file, in parts.
 
         Returns:
             The result of `make_encoder`.
@@ -114,7 +114,7 @@ class ModelCache:
             with tempfile.TemporaryDirectory(_UNFINISHED_SUFFIX, key, self._directory) as folder:
                 unfinished = os.path.join(folder, "half")
                 with open(unfinished, "wb", _WRITE_BYTES) as file:
-                    file.writelines(decoder)
+                    file.writelines(decoder_content)
                 os.replace(unfinished, self._cached_path(key, _DECODER_SUFFIX))
                 made = make_encoder(unfinished)
                 os.replace(unfinished, self._cached_path(key, _ENCODER_SUFFIX))
@@ -200,13 +200,13 @@ class Model:
                     raise no_memory_error(path) from error
         self._set_halves(*_split_and_cache(path, content, cache, key))
 
-    def encode(self, ids: Sequence[int], speaker: int, scale: float, run: ModelRun) -> Frames:
+    def encode(self, ids: Sequence[int], speaker: int, duration_factor: float, run: ModelRun) -> Frames:
         """Encode a sequence of phoneme ids as frames.
 
         Args:
             ids: The model's ids of the phonemes.
             speaker: The number of the speaker. It is ignored if the model has only one.
-            scale: A factor by which all durations are multiplied, in addition to the voice's own factor.
+            duration_factor: A factor by which all durations are multiplied, in addition to the voice's own factor.
             run: The handle that can end the run.
 
         Raises:
@@ -214,7 +214,7 @@ class Model:
         """
         import numpy as np
 
-        duration_scale = self.description.duration_scale * scale
+        duration_scale = self.description.duration_scale * duration_factor
         scales = [self.description.noise, duration_scale, self.description.duration_noise]
         feed = {
             "input": np.array([ids], np.int64),
@@ -256,9 +256,9 @@ class Model:
             raise VoiceFileError(f"{self.path} produces invalid samples; download the voice again")
         return part
 
-    def seconds(self, frames: int) -> float:
+    def seconds(self, frame_count: int) -> float:
         """Return the duration of this many frames in seconds."""
-        return frames * self._samples_per_frame / self.description.rate
+        return frame_count * self._samples_per_frame / self.description.rate
 
     def _set_halves(self, encoder: Any, decoder: Any) -> None:
         """Store both halves of the model, and test them.
@@ -278,10 +278,10 @@ class Model:
         self._frame_inputs = [each.name for each in decoder.get_inputs()]
         self._samples_per_frame = self._test_model()
 
-    def _run_half(self, half: Any, feed: dict[str, Any], run: ModelRun) -> list[Any]:
+    def _run_half(self, half: Any, inputs: dict[str, Any], run: ModelRun) -> list[Any]:
         """Run the encoder or the decoder, and return its outputs."""
         try:
-            found: list[Any] = half.run(None, feed, run.options)
+            found: list[Any] = half.run(None, inputs, run.options)
         except Exception as error:
             raise _model_error(self.path, "cannot be run", error) from error
         return found
@@ -312,11 +312,10 @@ class Model:
         return VoiceFileError(f"{both} do not belong together ({why[:_MAX_ERROR_CHARS]}); download both again")
 
 
-def load_libraries(path: str) -> None:
-    """Import numpy and onnxruntime.
+def load_libraries(model_path: str) -> None:
+    """Import numpy and onnxruntime. Errors name the model that needs them.
 
-    Error messages name the `path` of the model that needs them. This takes 0.25 s, and blocks all other threads for a
-    tenth of that time.
+    This takes 0.25 s, and blocks all other threads for a tenth of that time.
 
     Raises:
         VoiceFileError: The packages can't be imported, or there is not enough memory.
@@ -325,7 +324,7 @@ def load_libraries(path: str) -> None:
         import numpy as np  # noqa: F401 - onnxruntime would hide the reason if numpy can't be imported
         import onnxruntime  # noqa: F401
     except Exception as error:
-        raise _model_error(path, "could not be loaded", error, f"run: {install.neural()}") from error
+        raise _model_error(model_path, "could not be loaded", error, f"run: {install.neural()}") from error
 
 
 def _split_and_cache(path: str, content: bytes, cache: ModelCache | None, key: str) -> tuple[Any, Any]:
@@ -347,7 +346,7 @@ def _split_and_cache(path: str, content: bytes, cache: ModelCache | None, key: s
         raise _model_error(path, "could not be loaded", error) from error
 
 
-def _create_half_session(half: Sequence[Buffer], optimized_path: str | None = None) -> Any:
+def _create_half_session(half: Sequence[Buffer], save_optimized_to: str | None = None) -> Any:
     """Create an onnxruntime session for a half of a model.
 
     onnxruntime reads the half from a temporary file in memory. To pass bytes instead, the parts would have to be
@@ -358,15 +357,15 @@ def _create_half_session(half: Sequence[Buffer], optimized_path: str | None = No
         with open(os.memfd_create("half"), "wb", _WRITE_BYTES) as file:
             file.writelines(half)
             file.flush()
-            return _create_session(f"/proc/self/fd/{file.fileno()}", optimized_path)
+            return _create_session(f"/proc/self/fd/{file.fileno()}", save_optimized_to)
     except (OSError, AttributeError):  # The system doesn't support files in memory, or limits their size.
-        return _create_session(b"".join(half), optimized_path)
+        return _create_session(b"".join(half), save_optimized_to)
 
 
-def _create_session(model: str | bytes, optimized_path: str | None = None) -> Any:
+def _create_session(model: str | bytes, save_optimized_to: str | None = None) -> Any:
     """Create an onnxruntime session from the path or the content of a model.
 
-    If `optimized_path` is given, also write the optimized model to this path.
+    If `save_optimized_to` is given, also write the optimized model to this path.
     """
     import onnxruntime
 
@@ -378,20 +377,20 @@ def _create_session(model: str | bytes, optimized_path: str | None = None) -> An
     options.enable_cpu_mem_arena = options.enable_mem_pattern = False
     # Higher levels take 0.15 s longer, the model is no faster, and the result fits only one type of processor.
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
-    if optimized_path is not None:
-        options.optimized_model_filepath = optimized_path
+    if save_optimized_to is not None:
+        options.optimized_model_filepath = save_optimized_to
     return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
 
-def _model_error(path: str, problem: str, error: Exception, step: str = "download the voice again") -> VoiceFileError:
+def _model_error(path: str, problem: str, error: Exception, advice: str = "download the voice again") -> VoiceFileError:
     """Convert an exception of onnxruntime to a VoiceFileError.
 
-    `step` tells the user what to do next.
+    `advice` tells the user what to do next.
     """
     if _is_out_of_memory(error):
         return no_memory_error(path)
     first_line = (str(error).strip() or type(error).__name__).splitlines()[0]
-    return VoiceFileError(f"{path} {problem} ({first_line[:_MAX_ERROR_CHARS]}); {step}")
+    return VoiceFileError(f"{path} {problem} ({first_line[:_MAX_ERROR_CHARS]}); {advice}")
 
 
 def no_memory_error(path: str) -> VoiceFileError:

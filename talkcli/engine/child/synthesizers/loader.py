@@ -154,10 +154,9 @@ class ModelLoader:
         self.errors.pop(voice, None)
 
     def start(self, voice: str) -> None:
-        """Load a voice in the background.
+        """Queue a voice for loading in the background, or report at once that it is loaded.
 
-        If it is already loaded, add a `VoiceLoaded` event at once. When the load begins, any earlier error of the voice
-        is forgotten.
+        When the load begins, any earlier error of the voice is forgotten.
         """
         if voice in self._models:
             self._events.append(VoiceLoaded(voice, 0.0))
@@ -167,9 +166,9 @@ class ModelLoader:
             self._start_next_load()
 
     def get_model(self, voice: str) -> Model | None:
-        """Return the model of a voice, or None if it isn't loaded.
+        """Finish any complete load, and return the model of a voice, or None if it isn't loaded.
 
-        Unload a failed voice whose files have changed. If the thread of a load is done, finish the load first.
+        Unload a failed voice whose files have changed.
         """
         self._finish_load()
         model, fingerprints = self._models.get(voice, (None, ()))
@@ -180,7 +179,7 @@ class ModelLoader:
         return model
 
     def mark_spoken(self, voice: str) -> None:
-        """Schedule a memory measurement.
+        """Schedule a memory measurement, because a voice has just spoken.
 
         The first sentences with a voice need memory that is never freed.
         """
@@ -190,7 +189,7 @@ class ModelLoader:
             self._unmeasured = voice
 
     def take_events(self) -> list[VoiceLoaded | VoiceUnloaded | VoiceMemory]:
-        """Return and clear the events since the last call."""
+        """Finish any complete load, measure memory if due, and return and clear the new events."""
         self._finish_load()
         if self._unmeasured is not None:
             self._measure_memory(self._unmeasured, min_growth=GROWTH_BYTES)
@@ -198,7 +197,7 @@ class ModelLoader:
         return events
 
     def _finish_load(self) -> None:
-        """Finish the current load if it is complete or takes too long."""
+        """Store the result of a complete or overdue load, and start the next one."""
         load, voice = self._load, self._voice
         if load is None:
             return
@@ -224,9 +223,10 @@ class ModelLoader:
         self._start_next_load()
 
     def _measure_memory(self, voice: str, min_growth: float = -math.inf) -> None:
-        """Record an event with the memory of all voices, measured after this voice was loaded or used.
+        """Free unused memory, and record how much memory all voices use.
 
-        If the growth since the last event is below `min_growth` bytes, record nothing unless a voice was unloaded.
+        `voice` was just loaded or used. It is empty if a voice was unloaded. If the growth since the last event is
+        below `min_growth` bytes, record nothing unless a voice was unloaded.
         """
         self._unmeasured = None
         before, now = self._initial_bytes, _read_private_bytes()

@@ -78,7 +78,7 @@ class SpeechPart:
 
 
 def split_text(phonemizer: Phonemizer, text: str, *, ends_text: bool = True) -> Iterator[SpeechPart]:
-    """Split a text into parts that are short enough for one run of a model.
+    """Yield a text's phonemes in parts that are short enough for one run of a model.
 
     A text without any speech has no parts. The phonemizer is used only while a part is being requested.
 
@@ -124,26 +124,26 @@ def split_text(phonemizer: Phonemizer, text: str, *, ends_text: bool = True) -> 
         yield finish(ends_sentence=ends_text)
 
 
-def _split_long_groups(groups: Sequence[str]) -> Iterator[str]:
-    """Split groups of phonemes that are too long for a part."""
-    for group in groups:
+def _split_long_groups(phoneme_groups: Sequence[str]) -> Iterator[str]:
+    """Yield groups of phonemes, and cut those that are too long for one run of a model."""
+    for group in phoneme_groups:
         for begin in range(0, len(group), _MAX_SECTION_PHONEMES):
             yield group[begin : begin + _MAX_SECTION_PHONEMES]
 
 
 def _phoneme_groups(ipa: str) -> list[str]:
-    """Split IPA text at the blanks. Each character of the result is a phoneme."""
+    """Split IPA text at blanks and language marks. Each character in a group is a phoneme."""
     return [unicodedata.normalize("NFD", each) for each in _LANGUAGE_MARK.sub(" ", ipa).split()]
 
 
-def _locate_words(phonemizer: Phonemizer, clause: str, groups: Sequence[str]) -> list[tuple[int, int, int]]:
-    """Find the first phoneme of each word in a clause.
+def _locate_words(phonemizer: Phonemizer, clause: str, phoneme_groups: Sequence[str]) -> list[tuple[int, int, int]]:
+    """Return each word's first phoneme index, and its start and length in the clause.
 
     The phonemes are counted across all groups.
     """
     positions = phonemizer.word_positions(clause)
-    group_starts = [0, *itertools.accumulate(map(len, groups))]
-    if len(positions) == len(groups):
+    group_starts = [0, *itertools.accumulate(map(len, phoneme_groups))]
+    if len(positions) == len(phoneme_groups):
         return [(start, *position) for start, position in zip(group_starts, positions, strict=False)]
     if not positions:  # The library has reported no words for these phonemes.
         return []
@@ -155,7 +155,7 @@ def _locate_words(phonemizer: Phonemizer, clause: str, groups: Sequence[str]) ->
     words = [clause[start : min(start + length, next_start)] for (start, length), next_start in limits]
     alone = ["".join(itertools.chain(*(_phoneme_groups(ipa) for _, ipa in phonemizer.clauses(word)))) for word in words]
     ends = [0, *itertools.accumulate(map(len, alone))]
-    found = _map_indexes("".join(alone), "".join(groups), ends[:-1])
+    found = _map_indexes("".join(alone), "".join(phoneme_groups), ends[:-1])
     last = max(0, group_starts[-1] - 1)
     return [(min(start, last), *position) for start, position in zip(found, positions, strict=True)]
 
@@ -169,16 +169,16 @@ def _drop_repeated_positions(positions: Sequence[tuple[int, int]]) -> list[tuple
     return found
 
 
-def _map_indexes(first: str, second: str, places: Sequence[int]) -> list[int]:
-    """Convert indexes in one string to the corresponding indexes in a similar string."""
+def _map_indexes(first: str, second: str, indexes: Sequence[int]) -> list[int]:
+    """Convert indexes in `first` to the corresponding indexes in `second`, a similar string."""
     if len(first) * len(second) > _MAX_COMPARISONS:
-        return [place * len(second) // len(first) for place in places]
+        return [place * len(second) // len(first) for place in indexes]
     import difflib
 
     matcher = difflib.SequenceMatcher(None, first, second, autojunk=False)
     blocks = [difflib.Match(0, 0, 0), *matcher.get_matching_blocks()]
     found = []
-    for place in places:
+    for place in indexes:
         block = blocks[bisect.bisect_right(blocks, place, key=lambda each: each.a) - 1]
         found.append(block.b + min(place - block.a, block.size))
     return found

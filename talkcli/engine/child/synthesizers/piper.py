@@ -90,7 +90,7 @@ class Piper:
 
     @property
     def language(self) -> str:
-        """The libespeak-ng voice or language to use in place of the current voice.
+        """The libespeak-ng voice or language to use if the current voice fails.
 
         It comes from the description of the voice, or from its name if the description can't be read.
         """
@@ -194,7 +194,7 @@ class Piper:
 def _speak_parts(
     model: Model, parts: Iterator[SpeechPart], speaker: int, settings: SpeechSettings, run: ModelRun
 ) -> Iterator[SpokenPart]:
-    """Synthesize the parts of a text, and yield the sound in small pieces.
+    """Synthesize the parts of a text, and yield small pieces of sound with their words.
 
     Raises:
         VoiceFileError: The model is faulty, or doesn't know any of the phonemes.
@@ -240,7 +240,9 @@ def _speak_parts(
         raise VoiceFileError(f"{model.path}.json {why}; download both files from the same source")
 
 
-def _word_time(model: Model, part: SpeechPart, places: Sequence[int], begins: Sequence[int], at: int) -> float:
+def _word_time(
+    model: Model, part: SpeechPart, id_indexes: Sequence[int], id_frames: Sequence[int], start: int
+) -> float:
     """Return the time at which a word is heard, in seconds from the start of its part.
 
     Usually, this is when the word before it ends. The start of the word's first phoneme would be 41 to 93 ms too late.
@@ -250,13 +252,13 @@ def _word_time(model: Model, part: SpeechPart, places: Sequence[int], begins: Se
     Args:
         model: The model that speaks the part.
         part: The part of the text.
-        places: For each phoneme, the index of its first id.
-        begins: For each id, the frame at which it begins.
-        at: The index of the word's first phoneme.
+        id_indexes: For each phoneme, the index of its first id.
+        id_frames: For each id, the frame at which it begins.
+        start: The index of the word's first phoneme.
     """
-    own = begins[places[at]]
-    if at >= 2 and part.phonemes[at - 1] == " " and part.phonemes[at - 2] not in PAUSE_MARKS:
-        end = begins[places[at - 1] - len(model.description.phoneme_ids[PAD_SYMBOL])]
+    own = id_frames[id_indexes[start]]
+    if start >= 2 and part.phonemes[start - 1] == " " and part.phonemes[start - 2] not in PAUSE_MARKS:
+        end = id_frames[id_indexes[start - 1] - len(model.description.phoneme_ids[PAD_SYMBOL])]
         if model.seconds(own - end) < _WORD_GAP_S:
             return model.seconds(end)
     return model.seconds(own)
@@ -274,20 +276,20 @@ def _to_bytes(samples: Any, volume: float) -> bytes:
     return bytes((samples * (_FULL_SCALE * volume)).clip(-_FULL_SCALE, _FULL_SCALE).astype("<i2"))
 
 
-def _phoneme_ids(phonemes: Sequence[str], ids: Mapping[str, tuple[int, ...]]) -> tuple[list[int], list[int]]:
-    """Convert phonemes to the model's ids.
+def _phoneme_ids(phonemes: Sequence[str], id_map: Mapping[str, tuple[int, ...]]) -> tuple[list[int], list[int]]:
+    """Return the model's ids for phonemes, and the index of each phoneme's first id.
 
-    Also return the index of each phoneme's first id. If the model doesn't know a phoneme, it gets the index of the next
-    known phoneme, or of the end. If the model knows none of them, the list of indexes is empty.
+    If the model doesn't know a phoneme, it gets the index of the next known phoneme, or of the end. If the model knows
+    none of them, the list of indexes is empty.
     """
-    result = [*ids[BEGIN_SYMBOL], *ids[PAD_SYMBOL]]
+    result = [*id_map[BEGIN_SYMBOL], *id_map[PAD_SYMBOL]]
     places = []
     for phoneme in phonemes:
         places.append(len(result))
-        if ids.get(phoneme):
-            result += [*ids[phoneme], *ids[PAD_SYMBOL]]
-    known = any(ids.get(each) for each in phonemes)
-    return [*result, *ids[END_SYMBOL]], places if known else []
+        if id_map.get(phoneme):
+            result += [*id_map[phoneme], *id_map[PAD_SYMBOL]]
+    known = any(id_map.get(each) for each in phonemes)
+    return [*result, *id_map[END_SYMBOL]], places if known else []
 
 
 def _duration_scale(rate: int) -> float:

@@ -165,9 +165,9 @@ class _Graph:
         self.inputs = [each for each in fields if each[:2] == (_INPUT, _BYTES)]
         self.outputs = [each for each in fields if each[:2] == (_OUTPUT, _BYTES)]
 
-    def nodes_after(self, name: str) -> list[_Node]:
+    def nodes_after(self, value_name: str) -> list[_Node]:
         """Return the nodes that depend on a value, directly or indirectly."""
-        names = {name}
+        names = {value_name}
         found = []
         for node in self.nodes:
             if not names.isdisjoint(node.inputs):
@@ -175,9 +175,9 @@ class _Graph:
                 found.append(node)
         return found
 
-    def nodes_for(self, wanted: Iterable[str]) -> list[_Node]:
+    def nodes_for(self, value_names: Iterable[str]) -> list[_Node]:
         """Return the nodes that are needed to compute these values."""
-        names = {*wanted}
+        names = {*value_names}
         found = []
         for node in reversed(self.nodes):
             if not names.isdisjoint(node.outputs):
