@@ -21,7 +21,7 @@ from talkcli.client.client import check, too_long
 from talkcli.client.connect import GREETING_START
 from talkcli.goals.options import FLAG, Cancel, Say
 from talkcli.protocol import events
-from talkcli.protocol.lines import encode, write_request
+from talkcli.protocol.lines import encode, request_to_json
 from talkcli.protocol.requests import Hello, Pause, Resume, Status
 
 if TYPE_CHECKING:
@@ -192,14 +192,14 @@ def library_requests(parsed: plain.PlainCommand) -> tuple[Hello, Request]:
 def library_messages(parsed: plain.PlainCommand) -> tuple[JsonObject, JsonObject]:
     """Return the requests that the client library sends for a command, in JSON."""
     hello, request = library_requests(parsed)
-    return write_request(hello), write_request(request)
+    return request_to_json(hello), request_to_json(request)
 
 
 @settings(max_examples=50)
 @given(st.text(max_size=40))
 def test_any_text_is_sent_early_unchanged(text: str) -> None:
     parsed = plain.read(["say", "--", text], {})
-    assert not parsed or text == "-" or sent_early(parsed) == (write_request(Hello()), write_request(Say(text)))
+    assert not parsed or text == "-" or sent_early(parsed) == (request_to_json(Hello()), request_to_json(Say(text)))
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import pytest
 
 from talkcli.frozen import replace
 from talkcli.goals.goal import Sender
-from talkcli.goals.options import INITIAL, Say
+from talkcli.goals.options import DEFAULTS, Say
 from talkcli.goals.scheduler import Scheduler
 from talkcli.goals.states import State
 from talkcli.server import speech
@@ -43,7 +43,7 @@ def suspends(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 async def _speech_with_pending_goal(ttl: float) -> Speech:
-    served = Speech(Scheduler("4k7f", max_queue=1, settings=replace(INITIAL, ttl=ttl)))
+    served = Speech(Scheduler("4k7f", max_queue=1, settings=replace(DEFAULTS, ttl=ttl)))
     served.engine = _BusyEngine()  # type: ignore[assignment]
     served.scheduler.engine_ready(served.advance_time())
     for text in ("a long sentence", "the door is open"):

@@ -187,7 +187,7 @@ async def test_a_client_that_leaves_during_a_cancel_is_forgotten() -> None:
 
 @in_loop
 async def test_a_server_ends_only_after_answering_every_waiting_goal() -> None:
-    server, one, count = Server(), Client(), 3 * subscribers._MAX_PER_TURN
+    server, one, count = Server(), Client(), 3 * subscribers._MAX_CALLS_PER_TURN
     server.speech.scheduler.pause()
     server.fill(1)
     for number in range(count):
@@ -201,7 +201,7 @@ async def test_a_server_ends_only_after_answering_every_waiting_goal() -> None:
 
 @in_loop
 async def test_a_request_during_shutdown_is_answered_before_the_server_ends() -> None:
-    count = 3 * subscribers._MAX_PER_TURN
+    count = 3 * subscribers._MAX_CALLS_PER_TURN
     server, late = Server(count), Client()
     server.speech.scheduler.pause()
     server.fill(count)
@@ -268,8 +268,8 @@ async def test_cancelling_thousands_of_goals_does_not_block_other_clients() -> N
         server.ask(asking, Status(id="4k7f-1"))
         await asyncio.sleep(0)
         most = max(most, len(ended) - before)
-    assert most <= 2 * subscribers._MAX_PER_TURN
-    assert len(asking.replies) > count / subscribers._MAX_PER_TURN / 2
+    assert most <= 2 * subscribers._MAX_CALLS_PER_TURN
+    assert len(asking.replies) > count / subscribers._MAX_CALLS_PER_TURN / 2
 
 
 @in_loop

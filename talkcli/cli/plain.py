@@ -188,17 +188,17 @@ def early_messages(plain: PlainCommand) -> tuple[JsonObject, JsonObject] | None:
 
 def _early_request(command: str, given: dict[str, Any]) -> JsonObject | None:
     """Return a command's request message if it is simple enough to send early."""
-    from talkcli.protocol.lines import write_request
+    from talkcli.protocol.lines import request_to_json
 
     if command == "say":
         say = _say_request(given)
-        return write_request(say) if say else None
+        return request_to_json(say) if say else None
     if command == "cancel":
         ids, before, key = given["ids"], given["before"], given["key"]
         # Let the library handle several ids, because there may be duplicates or too many for one request.
         if len(ids) > 1 or not all(map(_is_full_id, [*ids, before or "-"])) or (key and check_key(key)):
             return None
-        return write_request(Cancel(ids or None, given["current"], before, key))
+        return request_to_json(Cancel(ids or None, given["current"], before, key))
     goal_id = given.get("goal_id")
     if goal_id is None:
         return {"request": command}

@@ -25,7 +25,7 @@ from talkcli.goals.goal import Goal
 from talkcli.goals.options import MAX_ID_CHARS, MAX_IDS, MAX_LOG_GOALS, STALL_S, Cancel, Say, Set, bad_option, check_key
 from talkcli.goals.states import State
 from talkcli.protocol.events import Canceled, ServerStatus, Snapshot, goal_in, goals
-from talkcli.protocol.lines import MAX_LINE_BYTES, request_line, write_request
+from talkcli.protocol.lines import MAX_LINE_BYTES, request_line, request_to_json
 from talkcli.protocol.requests import Log, Pause, Resume, Status, Voices, Wait, Watch
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 __all__ = ["Client", "GoalHandle"]
 
 #: Number of bytes in a request that are reserved for everything except the list of ids.
-_REST_OF_LINE_BYTES = 4096
+_RESERVED_LINE_BYTES = 4096
 #: The maximum size of an ASCII character, such as an escaped quote, and of any other character in JSON.
 _MAX_ASCII_BYTES, _MAX_CHARACTER_BYTES = 2, 12
 #: A `seq` with more digits than that of any real request.
@@ -428,10 +428,9 @@ class Client:
     # -- internal
 
     def _create_handle(self, request: Say) -> tuple[GoalHandle, OnReply]:
-        """Check a new goal, and create its handle.
+        """Check a new goal, and return its handle and the function that processes the reply.
 
-        Also return the function that processes the server's reply. If the text is too long for a request, the goal is
-        already REJECTED.
+        If the text is too long for a request, the goal is already REJECTED.
 
         Raises:
             UsageError: a value is out of its range.
@@ -447,7 +446,7 @@ class Client:
         return handle, accepted
 
     def _full_id(self, goal_id: str) -> str:
-        """Prefix an id with the boot id if it is only a number.
+        """Check a goal id, and put the boot id in front of it if it is only a number.
 
         Raises the same errors as `check_id`.
         """
@@ -457,10 +456,7 @@ class Client:
         return goal_id
 
     def _take_all(self, buffer: EventBuffer) -> Iterator[Event]:
-        """Yield the events of a buffer as they arrive.
-
-        Raises Lost when the buffer or the connection is closed.
-        """
+        """Yield the events of a buffer as they arrive, and raise Lost when no more can arrive."""
         for event in take_repeatedly(self._connection, lambda: buffer.take() or buffer.closed, None):
             if event is None or isinstance(event, str):
                 break
@@ -496,7 +492,7 @@ def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
         size = (_MAX_ASCII_BYTES if plain else _MAX_CHARACTER_BYTES) * len(each) + len('"", ')
         if not groups or size > room or len(groups[-1]) == MAX_IDS:
             groups.append([])
-            room = MAX_LINE_BYTES - _REST_OF_LINE_BYTES
+            room = MAX_LINE_BYTES - _RESERVED_LINE_BYTES
         room -= size
         groups[-1].append(each)
     return [tuple(each) for each in groups]
@@ -522,7 +518,7 @@ def too_long(request: Say) -> Goal | None:
         UsageError: `data` has no JSON form.
     """
     try:
-        line = request_line({"seq": _LONG_SEQ, **write_request(request)})
+        line = request_line({"seq": _LONG_SEQ, **request_to_json(request)})
     except ValueError as error:  # `data` contains NaN or an infinite number
         raise UsageError(f"'data' can't be sent as JSON: {error}") from None
     if len(line) <= MAX_LINE_BYTES:

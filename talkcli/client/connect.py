@@ -71,22 +71,22 @@ class ConnectionAttempt:
 
 
 def reach(
-    named: str | None, failures: tuple[tuple[str, Exception], ...] = (), only: str | None = None
+    named_path: str | None, failures: tuple[tuple[str, Exception], ...] = (), only_path: str | None = None
 ) -> ConnectionAttempt:
     """Try to connect to the first usable socket, without sending anything.
 
     Args:
-        named: path of the only socket to try, as the user named it; None for the usual places.
+        named_path: path of the only socket to try, as the user named it; None for the usual places.
         failures: the places that have already been tried, with their errors. They are skipped.
-        only: the only one of the usual places to try; None for all of them.
+        only_path: the only one of the usual places to try; None for all of them.
     """
-    for path in [only] if only else paths.client_sockets(named)[len(failures) :]:
+    for path in [only_path] if only_path else paths.client_sockets(named_path)[len(failures) :]:
         connected = _socket.socket(_socket.AF_UNIX, _socket.SOCK_STREAM)
         # Don't block, because a stopped server with a full backlog would block the client for ever.
         connected.setblocking(False)
         try:
             connected.connect(path)
-            if not named and path != paths.SYSTEM_SOCKET:
+            if not named_path and path != paths.SYSTEM_SOCKET:
                 _check_owner(connected)
         except (OSError, AccessDenied) as error:
             connected.close()
@@ -106,26 +106,25 @@ def _check_owner(connected: _socket.socket) -> None:
 
 
 def send_early(
-    attempt: ConnectionAttempt, hello: JsonObject, request: JsonObject, before: Callable[[], None]
+    attempt: ConnectionAttempt, hello: JsonObject, request: JsonObject, before_request: Callable[[], None]
 ) -> ConnectionAttempt | None:
-    """Send hello, and the first request if the greeting arrives soon.
+    """Send hello, and the first request if the server's greeting arrives soon.
 
-    Return the new state, or None if disconnected. The request is not sent if the greeting is late or unexpected, or if
-    the server may lack a feature.
+    The request is not sent if the greeting is late or unexpected, or if the server may lack a feature.
 
     Args:
         attempt: an open connection.
         hello: the hello message.
         request: the first request.
-        before: called immediately before the request is sent.
+        before_request: called immediately before the request is sent.
 
     Returns:
         The connection with its progress, or None if the connection broke before a request was sent.
     """
     from talkcli.protocol.features import missing_features
-    from talkcli.protocol.lines import FIRST_NUMBER, request_line
+    from talkcli.protocol.lines import FIRST_SEQ, request_line
 
-    connected, line = attempt.socket, request_line({"seq": FIRST_NUMBER, **request})
+    connected, line = attempt.socket, request_line({"seq": FIRST_SEQ, **request})
     assert connected
     received = sent = b""
     connected.settimeout(GREETING_WAIT_S)
@@ -134,7 +133,7 @@ def send_early(
         received = connected.recv(65536)
         known = received.startswith(GREETING_START) and b"\n" in received
         if known and all(f'"{each}"'.encode() in received for each in missing_features(request, ())):
-            before()
+            before_request()
             sent = line[: connected.send(line)]
     except TimeoutError:
         pass  # the server may be busy, so `connect` waits longer
@@ -194,7 +193,7 @@ def hello(name: str | None, *, urgent: bool) -> JsonObject:
 
 
 def connect(
-    named: str | None,
+    named_path: str | None,
     hello: JsonObject,
     patience: float = ANSWER_LIMIT_S,
     interrupt: Mapping[int, int] | None = None,
@@ -202,12 +201,10 @@ def connect(
     keep_trying: float = 0.0,
     end: float | None = None,
 ) -> ConnectionAttempt:
-    """Connect to the first usable server, and read its greeting.
-
-    Retry for a limited time.
+    """Connect to the first usable server, and read its greeting. Retry for a limited time.
 
     Args:
-        named: path of the only socket to try; None for the usual places.
+        named_path: path of the only socket to try; None for the usual places.
         hello: the hello message.
         patience: seconds in which the server must send its greeting. If it has too many clients or a full backlog, this
             is also how long to try again.
@@ -222,7 +219,7 @@ def connect(
         Interrupted: one of the interrupting descriptors is ready.
     """
     give_up = time.monotonic() + (keep_trying or patience)
-    attempt = attempt or reach(named)
+    attempt = attempt or reach(named_path)
     while True:
         error: TalkError | None = None
         again = attempt.backlog_full or (keep_trying > 0 and _server_may_start(attempt))
@@ -235,7 +232,7 @@ def connect(
             except AccessDenied as denied:
                 if attempt.request_sent:
                     raise
-                attempt = reach(named, (*attempt.failures, (attempt.path, denied)))
+                attempt = reach(named_path, (*attempt.failures, (attempt.path, denied)))
                 continue
             except Busy as refused:
                 error, again = refused, True
@@ -244,15 +241,15 @@ def connect(
                 again = keep_trying > 0
         left = give_up - time.monotonic()
         if not again or attempt.request_sent or left <= 0:
-            raise error or unreachable(attempt, named)
+            raise error or unreachable_error(attempt, named_path)
         import random  # rarely needed, and slow to import
 
         wait_ready({}, min(random.uniform(*RETRY_PAUSE_S), left), interrupt)
-        attempt = reach(named)
+        attempt = reach(named_path)
 
 
 def _server_may_start(attempt: ConnectionAttempt) -> bool:
-    """Return whether a server may still be starting at one of the paths."""
+    """Return whether a server may still be starting at one of the tried paths."""
     found = {paths.describe_place(path, error) for path, error in attempt.failures if isinstance(error, OSError)}
     return not found.isdisjoint({paths.PLACE_ABSENT, paths.PLACE_STALE})
 
@@ -260,7 +257,7 @@ def _server_may_start(attempt: ConnectionAttempt) -> bool:
 def _greet(
     attempt: ConnectionAttempt, hello: JsonObject, end: float, interrupt: Mapping[int, int] | None
 ) -> ConnectionAttempt:
-    """Send hello if necessary, and read the server's greeting.
+    """Send hello if necessary, and add the server's greeting to the attempt.
 
     The connection is closed if the greeting has not arrived by `end` (monotonic), and after any other error.
 
@@ -299,7 +296,7 @@ def _greet(
     return replace(attempt, received=received, server=server)
 
 
-def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
+def unreachable_error(attempt: ConnectionAttempt, named_path: str | None) -> TalkError:
     """Return an error that lists the unusable sockets and gives advice."""
     if attempt.backlog_full:
         path = attempt.failures[-1][0]
@@ -316,8 +313,8 @@ def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
         denied = denied or isinstance(error, AccessDenied) or found == paths.PLACE_FORBIDDEN
         tried += f"  {path}: {words}\n"
     step = f"{_LET_IN_STEP}\n{_START_OWN_STEP}" if denied else _START_STEP
-    if named:
-        step = _advice_for_named_socket(named, found, denied=denied)
+    if named_path:
+        step = _advice_for_named_socket(named_path, found, denied=denied)
     hint = paths.sudo_caller_socket()
     if hint and not os.environ.get("TALK_SOCKET") and hint not in dict(attempt.failures):
         step += f"\nto use the server of the user who called sudo, run: talk --socket {hint}"
@@ -326,11 +323,11 @@ def unreachable(attempt: ConnectionAttempt, named: str | None) -> TalkError:
     return ServerUnavailable(f"no server found; tried:\n{tried}{step}")
 
 
-def _advice_for_named_socket(named: str, found: str, *, denied: bool) -> str:
+def _advice_for_named_socket(named_path: str, found: str, *, denied: bool) -> str:
     """Return advice for a user who named a socket with an option or a variable.
 
     Args:
-        named: the path as the user named it.
+        named_path: the path as the user named it.
         found: what is there, as described by `paths.describe_place`.
         denied: whether the server there refuses this user.
     """
@@ -338,8 +335,8 @@ def _advice_for_named_socket(named: str, found: str, *, denied: bool) -> str:
 
     from talkcli.terminal.text import printable
 
-    by_variable = named == os.environ.get("TALK_SOCKET")
-    place = shlex.quote(printable(_socket_inside(named) if found == paths.PLACE_DIRECTORY else named))
+    by_variable = named_path == os.environ.get("TALK_SOCKET")
+    place = shlex.quote(printable(_socket_inside(named_path) if found == paths.PLACE_DIRECTORY else named_path))
     if denied:
         step = _LET_IN_STEP if by_variable else f"{_LET_IN_STEP}\n{_START_OWN_STEP}"
     elif found == paths.PLACE_FILE:

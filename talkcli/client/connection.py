@@ -13,7 +13,7 @@ import time
 from _socket import SHUT_RDWR  # importing `socket` takes longer (see `peers`)
 
 from talkcli import paths, peers
-from talkcli.client.connect import ANSWER_LIMIT_S, connect, hello, reach, sender_name, unreachable
+from talkcli.client.connect import ANSWER_LIMIT_S, connect, hello, reach, sender_name, unreachable_error
 from talkcli.client.core import MAX_UNSENT_BYTES, ClientCore, Exchange
 from talkcli.errors import ProtocolMismatch, ServerUnavailable, TalkError, UsageError
 from talkcli.frozen import TYPE_CHECKING
@@ -41,9 +41,9 @@ _RECONNECT_PAUSE_S = 0.1
 
 
 def checked_sender_name(name: str | None) -> str | None:
-    """Return the given name, or else the value of TALK_NAME.
+    """Return the given name or else TALK_NAME, or raise UsageError if it is too long.
 
-    Return None if neither is set. Raises UsageError if the name is too long.
+    Return None if neither is set.
     """
     name = sender_name(name)
     if name and len(name) > MAX_SENDER_NAME_CHARS:
@@ -52,11 +52,10 @@ def checked_sender_name(name: str | None) -> str | None:
 
 
 def take_repeatedly(connection: Connection, take: Callable[[], _T], end: float | None) -> Iterator[_T]:
-    """Call `take` repeatedly, and yield its results.
+    """Yield the results of `take`, and wait for the server while there are none.
 
-    While there is no result, wait for the server. An empty result is yielded if `end` has passed or the connection has
-    ended. Nothing more is received after `end`, so that a loop over the results ends even if the server keeps sending
-    events.
+    An empty result is yielded if `end` has passed or the connection has ended. Nothing more is received after `end`,
+    so that a loop over the results ends even if the server keeps sending events.
 
     Args:
         connection: the connection to wait for.
@@ -160,7 +159,7 @@ class Connection(ClientCore):
         return self.answer(exchange)
 
     def begin(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> Exchange:
-        """Send a request without waiting for the answer.
+        """Send a request, and return its exchange without waiting for the answer.
 
         The arguments are those of `Exchange`.
         A caller without `on_failure` must call `forget` if it stops waiting for the answer.
@@ -177,7 +176,7 @@ class Connection(ClientCore):
         return exchange
 
     def submit(self, request: Request, on_reply: OnReply, on_failure: OnFailure) -> None:
-        """Send a request without blocking.
+        """Send a request without blocking, and call one of the functions with its outcome.
 
         Later calls send the bytes that the server doesn't accept now. One of the two functions is called during this
         call or a later one, while the lock `changed` is held.
@@ -484,10 +483,7 @@ class ReconnectingConnection(SocketConnection):
                 polled.close()
 
     def receive(self, data: bytes, now: float) -> None:
-        """Process received bytes.
-
-        If the greeting refuses this client, disconnect and try again later.
-        """
+        """Process received bytes. If the greeting refuses this client, disconnect and retry."""
         try:
             super().receive(data, now)
         except TalkError as error:  # the greeting shows that the server can't be used
@@ -501,21 +497,21 @@ class ReconnectingConnection(SocketConnection):
         """
         if self._socket is not None or (now < self._due and not at_once):
             return
-        found = reach(self._named, only=self.path)
+        found = reach(self._named, only_path=self.path)
         if found.socket is None:
-            self._schedule_retry(unreachable(found, self._named), now)
+            self._schedule_retry(unreachable_error(found, self._named), now)
             return
         self._socket, self._due = found.socket, now + self._patience
         self.connecting(request_line(self._hello_message))
         self._flush()
 
     def _schedule_retry(self, error: TalkError, now: float) -> None:
-        """Record a failed attempt to connect, and schedule the next one."""
+        """Record a failed attempt to connect, fail waiting requests, and schedule a retry."""
         self._due = now + _RECONNECT_PAUSE_S
         self.not_connected(error)
 
     def _give_up_socket(self) -> None:
-        """Disconnect.
+        """Disconnect, and close the socket unless a thread is reading from it.
 
         If a thread is reading, that thread closes the socket, because it may still be polling it. The caller must hold
         the lock `changed`.

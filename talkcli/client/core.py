@@ -36,7 +36,7 @@ from talkcli.goals.states import State
 from talkcli.protocol import events
 from talkcli.protocol.events import PausedChanged, Result, ServerStatus, Snapshot, StateChanged, WordHeard, goals
 from talkcli.protocol.features import FEATURES, missing_features
-from talkcli.protocol.lines import FIRST_NUMBER, LineSplitter, decode, request_line, write_request
+from talkcli.protocol.lines import FIRST_SEQ, LineSplitter, decode, request_line, request_to_json
 from talkcli.protocol.requests import Pause, Wait, Watch
 
 if TYPE_CHECKING:
@@ -194,7 +194,7 @@ class TrackedGoal:
         self._buffer = EventBuffer()
 
     def _expect(self, request: Say, now: float) -> None:
-        """Prepare the goal for an unanswered `say` request."""
+        """Set the goal's id and text from a `say` request, before the server answers."""
         self.goal = replace(self.goal, id=request.id or "", text=request.text)
         if request.wait:
             self._followed_at = now
@@ -206,7 +206,7 @@ class TrackedGoal:
         self.speech_paused = reply.get("paused") is True
 
     def _listen_to(self, listeners: EventListeners, *, feedback: bool, now: float) -> None:
-        """Record that the server sends the goal's events from now on."""
+        """Register for the goal's events, which the server sends from now on."""
         self._with_feedback = self._with_feedback or feedback
         if self._followed_at is None:
             self._followed_at = now
@@ -289,19 +289,14 @@ class ServerInfo:
 
     @classmethod
     def read(cls, server: JsonObject) -> ServerInfo:
-        """Read a description.
-
-        An invalid field is treated as missing.
-        """
+        """Read a server's description from a JSON object, without its invalid fields."""
         features = server.get("features")
         names = tuple(map(str, features)) if isinstance(features, list) else None
         return cls(**{**read_fields(cls, {**server, "features": None}), "features": names})
 
 
 def read_greeting(line: bytes, path: str) -> ServerInfo:
-    """Read a server's first line.
-
-    Raises an error if the server can't be used.
+    """Read a server's first line, or raise an error if the server can't be used.
 
     Raises:
         ServerUnavailable: the line is not a greeting.
@@ -392,7 +387,7 @@ class ClientCore:
         #: the error of the last attempt to reconnect, or None if it succeeded
         self.connect_error: TalkError | None = None
         self._patience = patience
-        self._numbers: Iterator[int] = itertools.count(FIRST_NUMBER)
+        self._numbers: Iterator[int] = itertools.count(FIRST_SEQ)
         self._splitter = LineSplitter()
         #: monotonic time at which bytes were last received
         self._heard = now
@@ -429,7 +424,7 @@ class ClientCore:
 
     def line(self, exchange: Exchange) -> bytes:
         """Return the line that contains the request of a registered exchange."""
-        return request_line({"seq": exchange.number, **write_request(exchange.request)})
+        return request_line({"seq": exchange.number, **request_to_json(exchange.request)})
 
     def queue(self, line: bytes, exchange: Exchange) -> None:
         """Queue an exchange's line for sending.
@@ -473,9 +468,7 @@ class ClientCore:
         self._first_sent_bytes = count
 
     def forget(self, exchange: Exchange) -> bool:
-        """Stop waiting for an answer, and remove the request if it is unsent.
-
-        Return False if part of it was sent.
+        """Drop an exchange and its unsent request. Return False if part of the request was sent.
 
         Returns:
             False if a part of the line has been sent. The connection must then be closed before the newline is sent,
@@ -534,7 +527,7 @@ class ClientCore:
         Return None if the server's features are unknown.
         """
         features = self.server.features
-        missing = missing_features(write_request(request), features) if features is not None else []
+        missing = missing_features(request_to_json(request), features) if features is not None else []
         if not missing:
             return None
         from talkcli.terminal.text import printable  # rarely needed, and slow to import
@@ -576,20 +569,18 @@ class ClientCore:
         return max(began, self._heard) + SILENCE_LIMIT_S, f"the server sent nothing for {SILENCE_LIMIT_S:g} s"
 
     def goals_lost_at(self) -> float:
-        """Return the time at which followed goals become LOST while disconnected."""
+        """Return the time at which followed goals become LOST, or inf while connected."""
         return float("inf") if self.absent_since is None else self.absent_since + self._patience
 
     def next_expiry(self) -> float:
-        """Return the time by which `expire` must be called."""
+        """Return the time by which `expire` must be called, or inf for never."""
         times = [self.answer_deadline(each) for each in self.exchanges.values()]
         if self.listeners.goals:
             times.append(self.goals_lost_at())
         return min(times, default=float("inf"))
 
     def expire(self, now: float) -> bool:
-        """Fail late requests, and end goals after a long disconnection.
-
-        Return False if the connection must be closed.
+        """Fail late requests, and end goals as LOST if the client was disconnected too long.
 
         Returns:
             False if the connection must be closed, because a part of a line has been sent (see `forget`).
@@ -640,9 +631,9 @@ class ClientCore:
         return self.exchanges.get(number) if isinstance(number, int) else None
 
     def dispatch(self, message: JsonObject, now: float) -> Exchange | None:
-        """Process a received event, list item or reply.
+        """Process a received message, and return the exchange that it has ended, if any.
 
-        Return the exchange that a reply has ended, if any.
+        The message is an event, a list item or a reply.
 
         Raises:
             ValueError: the event, or a goal in the reply, is malformed.
@@ -663,9 +654,7 @@ class ClientCore:
         return exchange
 
     def _finish(self, exchange: Exchange, reply: JsonObject) -> None:
-        """End an exchange after its reply has arrived.
-
-        Calls the callbacks.
+        """End an exchange with its reply, and call its function for success or failure.
 
         Raises:
             Unreadable: a goal in the reply is malformed.
@@ -701,9 +690,9 @@ class ClientCore:
         self._fail_all()
 
     def disconnected(self, why: str, now: float) -> None:
-        """Record that the connection has broken.
+        """Record that the connection has broken, and fail all unanswered requests.
 
-        Fail unanswered requests, and end watches that don't reconnect.
+        Also end the watches that don't reconnect.
         """
         self.absence = self._last_error or why
         self.absent_since, self._last_error, self._sending_ended = now, None, None
@@ -732,10 +721,10 @@ class ClientCore:
             self.fail(exchange, error)
 
     def connected(self, server: ServerInfo, now: float) -> None:
-        """Record the greeting on a new connection.
+        """Record the greeting after reconnecting, and follow all goals again or end them.
 
-        Follow all goals again, or end them as LOST. Goals are followed again if the server wasn't restarted in the
-        meantime. Otherwise they are LOST.
+        The goals are followed again if the server wasn't restarted in the meantime. Otherwise they are LOST. Watches
+        and waiting requests are sent again.
 
         Args:
             server: the server's greeting. Each start of the server has another boot id.

@@ -105,10 +105,10 @@ class GoalHandle(TrackedGoal):
         return (each for each in self._iterate_events(end, timeout) if isinstance(each, WordHeard))
 
     def poll(self) -> Event | None:
-        """Read from the server without blocking.
+        """Read from the server without blocking, and return the goal's next event, if any.
 
-        Return the goal's next event, or None if there is none. The Result is the last event. Call this method
-        regularly, because each call also receives the events of other goals, and sends the rest of earlier requests.
+        The Result is the last event. Call this method regularly, because each call also receives the events of other
+        goals, and sends the rest of earlier requests.
 
         Raises:
             UsageError: the goal was sent with `follow=False`, and neither `wait` nor `events` has been called.
@@ -161,7 +161,7 @@ class GoalHandle(TrackedGoal):
     # -- internal
 
     def _listen(self, *, feedback: bool) -> None:
-        """Register for the goal's events, optionally with words.
+        """Register this handle to receive the goal's events, optionally with words.
 
         The caller must hold the connection's lock.
         """
@@ -199,10 +199,7 @@ class GoalHandle(TrackedGoal):
             raise TimeoutError(f"goal {self.id} has not ended after {0 if timeout is None else round(timeout, 1):g} s")
 
     def _lose_if_disconnected(self) -> bool:
-        """End the goal as LOST if the connection has ended.
-
-        Return whether the connection has ended.
-        """
+        """If the connection has ended, end the goal as LOST and return True."""
         ended = self._connection.ended
         if ended is not None:
             with self._connection.changed:

@@ -46,10 +46,7 @@ class TextSender:
         return self._open
 
     def accepted(self, goal_id: str) -> str:
-        """Record that the server has accepted the open request.
-
-        Return the text of this request.
-        """
+        """Record that the server has accepted the open request, and return its text."""
         request = self._open
         assert request
         self.refused()

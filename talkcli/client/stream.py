@@ -134,7 +134,7 @@ class SpeechStream:
         self.goal._grow(self._text.accepted(self.goal.id))
 
     def _process_error(self, error: TalkError) -> None:
-        """Record that a request to add text has failed, so that the goal takes no more text.
+        """Record that the goal takes no more text, unless the error only concerns the last text.
 
         Raises:
             RequestRefused: the error only concerns the last text.

@@ -59,14 +59,14 @@ class By:
     client: Sender | None = None
 
     def to_json(self) -> JsonObject | None:
-        """Return a JSON object with the goal or the client."""
+        """Return a JSON object with the goal or the client, or None for the server itself."""
         if self.goal is not None:
             return {"goal": self.goal}
         return None if self.client is None else {"client": self.client.to_json()}
 
     @classmethod
     def from_json(cls, value: object) -> By | None:
-        """Read the value from its JSON object. Return None if it isn't an object."""
+        """Read a goal or client from its JSON object. Return None if it isn't an object."""
         return cls(**read_fields(cls, value)) if isinstance(value, dict) else None
 
 
@@ -95,7 +95,7 @@ class Output:
 
 @frozen
 class Goal:
-    """An immutable copy of a goal.
+    """An immutable snapshot of a goal: its text, its state and how it ended.
 
     Its JSON always contains all keys, with null for unknown values. Times are seconds since 1970 UTC. `duration` is the
     length of the audio in seconds.
@@ -173,9 +173,9 @@ class Goal:
 
     @classmethod
     def from_json(cls, value: object) -> Goal:
-        """Read a goal from its JSON object.
+        """Read a goal from its JSON object, or raise Unreadable.
 
-        Raises Unreadable if the id or the state is missing or invalid.
+        The id and the state are required. Other fields that are missing or malformed get their defaults.
         """
         found = read_fields(cls, value)
         if not str(found.get("id", "\n")).isprintable() or "state" not in found:  # ids are printed unescaped
@@ -184,10 +184,7 @@ class Goal:
 
 
 def read_fields(cls: type, message: object) -> dict[str, Any]:
-    """Read the fields of a class from a JSON object.
-
-    Values of the wrong type are skipped.
-    """
+    """Return the values in a JSON object that are valid for the fields of a class."""
     found = {}
     values = message if isinstance(message, dict) else {}
     for name, annotation in cls.__annotations__.items():
@@ -203,8 +200,8 @@ def message_details(message: str | None) -> str:
     return details if head in _STATE_WORDS else message or ""
 
 
-def _reader(kind: type) -> Callable[[object], object]:
-    """Create a function that turns values of any other type into None."""
+def _create_reader(kind: type) -> Callable[[object], object]:
+    """Create a function that returns a value of this type unchanged, and None for any other."""
     return lambda value: value if type(value) is kind else None
 
 
@@ -216,11 +213,11 @@ def read_seconds(value: object) -> float | None:
 
 #: Functions that read a field's value, by type annotation. They return None if the value has the wrong type.
 _READERS: dict[str, Callable[[object], object]] = {
-    "str": _reader(str),
-    "int": _reader(int),
+    "str": _create_reader(str),
+    "int": _create_reader(int),
     "float": read_seconds,
-    "bool": _reader(bool),
-    "JsonObject": _reader(dict),
+    "bool": _create_reader(bool),
+    "JsonObject": _create_reader(dict),
     "State": lambda value: State.__members__.get(value) if isinstance(value, str) else None,
     "By": By.from_json,
     "Sender": Sender.from_json,

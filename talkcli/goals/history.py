@@ -41,7 +41,7 @@ MAX_EARLY_CANCELS = 1_000
 
 
 class History:
-    """Records of ended goals, oldest first.
+    """The records of recently ended goals, oldest first.
 
     The number of goals and the size of their texts are limited.
     """
@@ -70,14 +70,14 @@ class History:
         """Return the ended goal with this id, or None if it isn't known."""
         return self._all.get(goal_id)
 
-    def latest(self, count: int, *, rejected: bool) -> list[Record]:
+    def latest(self, count: int, *, include_rejected: bool) -> list[Record]:
         """Return the most recently ended goals, oldest first.
 
         Args:
             count: the maximum number of goals.
-            rejected: whether to include rejected goals.
+            include_rejected: whether to include rejected goals.
         """
-        newest = (each for each in reversed(self._all.values()) if rejected or each.state is not State.REJECTED)
+        newest = (each for each in reversed(self._all.values()) if include_rejected or each.state is not State.REJECTED)
         return list(islice(newest, count))[::-1]
 
 
@@ -98,9 +98,9 @@ class SpeechTimes:
                 _set_newest(self._starts, each, (record.began_at, record.id), MAX_SPEECH_TIMES)
 
     def last_goal_id(self, since: float, key: str | None, text: str) -> str | None:
-        """Return the id of the last goal with a key or, without a key, with a text.
+        """Return the id of the last goal that started after `since` with this key or text.
 
-        Return None if no goal started after `since` (monotonic) with this key or text.
+        The text counts only if `key` is None. Return None if there is no such goal. Times are monotonic.
         """
         last = self._starts.get(_digest(text) if key is None else key)
         return last[1] if last is not None and last[0] > since else None
@@ -124,10 +124,7 @@ class EarlyCancels:
 
 
 def _set_newest(entries: OrderedDict[_Key, _Value], key: _Key, value: _Value, limit: int) -> None:
-    """Add or replace an entry as the newest one.
-
-    If there are too many entries, drop the oldest.
-    """
+    """Set an entry as the newest one, and drop the oldest if there are too many."""
     entries[key] = value
     entries.move_to_end(key)
     if len(entries) > limit:

@@ -65,10 +65,7 @@ _MAX_FLOAT = 1.7976931348623157e308
 
 
 def without_speaker(voice: str | None) -> str:
-    """Return the id of a voice without its speaker.
-
-    Return an empty string if the voice is None.
-    """
+    """Return the id of a voice without its speaker, or an empty string for None."""
     return (voice or "").partition(SPEAKER_MARK)[0]
 
 
@@ -158,7 +155,7 @@ IDS = Kind("list", (list, tuple), f"must be a list of at most {MAX_IDS} ids", "[
 
 @frozen
 class Setting:
-    """The server's default value for a goal option, and how to describe it."""
+    """The server's default value for a goal option, with its documentation and flags."""
 
     initial: Any
     #: value that means "none" and is shown as null
@@ -669,10 +666,9 @@ class Cancel:
         return self.ids is None and not self.current and self.before is None and self.key is None
 
     def select_waiting(self, goals: Sequence[Say]) -> list[int]:
-        """Return the indexes of the waiting goals that the request cancels.
+        """Return the indexes of those goals waiting for room in the queue that the request cancels.
 
-        All these goals wait for room in the queue. They have an id only if their sender chose one, so `before` selects
-        them only if it names such an id.
+        The goals have an id only if their sender chose one, so `before` selects them only if it names such an id.
         """
         ids = set(self.ids or ())
         last = max((index for index, say in enumerate(goals) if say.id == self.before is not None), default=-1)
@@ -697,7 +693,7 @@ for _request in (Say, Append, Set, Cancel):
     require_fields(_request, (each.name for each in _request.options))
 
 #: Settings of a server that was started without options.
-INITIAL = Set(**{each.name: each.setting.initial for each in SETTINGS if each.setting})
+DEFAULTS = Set(**{each.name: each.setting.initial for each in SETTINGS if each.setting})
 
 
 def bad_option(request: Say | Set) -> str | None:
@@ -714,7 +710,7 @@ def bad_option(request: Say | Set) -> str | None:
 
 
 def bad_text(text: str, max_chars: int | None = MAX_TEXT_CHARS) -> Refusal | None:
-    """Return the reason why a text can't be spoken, if there is an obvious one.
+    """Return the reason and a message if a text obviously can't be spoken, or None.
 
     Args:
         text: the text.
@@ -737,7 +733,9 @@ def is_visible(text: str) -> bool:
 
 
 def bad_characters(text: str, max_chars: int | None, before_chars: int = 0) -> Refusal | None:
-    """Return the reason why a text is too long or contains characters that aren't allowed, or None.
+    """Return the reason and a message if a text is too long or has a forbidden character.
+
+    Otherwise, return None.
 
     Args:
         text: the text.

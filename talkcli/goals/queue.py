@@ -80,9 +80,9 @@ class Queue:
         return self._displaceable[-1][2] if self._displaceable else None
 
     def add(self, record: Record, replaced: Record | None = None) -> None:
-        """Add a goal at its place in the speaking order.
+        """Add a goal at its place in the speaking order, or in the place of a removed goal.
 
-        This is behind the other goals of its priority, or in front of them if the goal preempts.
+        Its place is behind the other goals of its priority, or in front of them if the goal preempts.
 
         Args:
             record: the new goal.
@@ -103,10 +103,7 @@ class Queue:
             del self._by_key[record.say.key]
 
     def next_expiry(self) -> float:
-        """Return the monotonic time at which the next goal expires.
-
-        Return inf if no goal can expire.
-        """
+        """Return the monotonic time at which the next goal expires, or inf if none can."""
         return self._expiries[0][0] if self._expiries else inf
 
     def expired(self, now: float) -> list[Record]:

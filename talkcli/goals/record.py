@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from talkcli.goals.reasons import Reason
 
 #: Fields of a goal that are set after the goal was accepted.
-_LATER = ("reason", "by", "message", "started_at", "ended_at", "duration", "voice", "output")
-require_fields(Goal, (*SHOWN_OPTIONS, *_LATER))
+_FIELDS_SET_LATER = ("reason", "by", "message", "started_at", "ended_at", "duration", "voice", "output")
+require_fields(Goal, (*SHOWN_OPTIONS, *_FIELDS_SET_LATER))
 
 
 @dataclass(slots=True, eq=False)
@@ -104,7 +104,7 @@ class Record:
         return text == self.say.text[: self.first_chars]
 
     def snapshot(self, state: State | None = None) -> Goal:
-        """Return an immutable copy of the goal.
+        """Return an immutable copy of the goal, in its current state or in the given one.
 
         Args:
             state: the state to show instead of the current one. With PENDING, the copy shows the goal as it was
@@ -114,7 +114,7 @@ class Record:
         text = self.say.text if self.text_hash is None else None
         shown = {name: getattr(self.say, name) for name in SHOWN_OPTIONS}
         if state is not State.PENDING:
-            shown |= {name: getattr(self, name) for name in _LATER}
+            shown |= {name: getattr(self, name) for name in _FIELDS_SET_LATER}
             if self.started_at is not None:
                 shown |= {"spoken_end": self.spoken_end, "heard": self.heard}
                 shown["spoken"] = None if text is None else text[: self.begun_end]

@@ -85,7 +85,7 @@ Effect = StateChange | EngineOrder | VoiceLoadOrder | VoiceDropOrder | VoiceWarn
 
 @dataclass(slots=True)
 class Cancellation:
-    """The result of `Scheduler.cancel`."""
+    """The goals that a cancel affects, and the effects to carry out."""
 
     #: pending goals that this cancel has recalled
     recalled: list[Record] = field(default_factory=list)
@@ -99,7 +99,7 @@ class Cancellation:
 
 
 class Scheduler:
-    """Schedules the goals of one server."""
+    """Decides which goal of a server is spoken next, and how each goal ends."""
 
     def __init__(
         self,
@@ -107,7 +107,7 @@ class Scheduler:
         *,
         max_queue: int,
         max_text: int = options.MAX_TEXT_CHARS,
-        settings: Set = options.INITIAL,
+        settings: Set = options.DEFAULTS,
         voices: VoiceScheduler | None = None,
     ) -> None:
         """Create a scheduler with no goals and no engine.
@@ -187,19 +187,19 @@ class Scheduler:
         sender: Sender,
         now: Now,
         refusal: Refusal | None = None,
-        canceled: By | None = None,
+        canceler: By | None = None,
         waited_s: float = 0.0,
     ) -> tuple[Record, list[Effect]]:
-        """Reject a goal or add it to the queue.
+        """Reject a goal or add it to the queue, and return its record and the effects.
 
-        Return its record, and the effects to carry out. A rejected goal doesn't affect other goals.
+        A rejected goal doesn't affect other goals.
 
         Args:
             say: the goal.
             sender: the program that sent the goal.
             now: the current time.
             refusal: the server's own reason to reject the goal, or None.
-            canceled: the client that cancelled the goal while it waited for room. The goal is accepted and recalled.
+            canceler: the client that cancelled the goal while it waited for room. The goal is accepted and recalled.
             waited_s: how long the goal waited for room, which counts towards its time to live.
 
         Returns:
@@ -215,8 +215,8 @@ class Scheduler:
         number, asked = self._count, say if ttl == say.ttl else replace(say, ttl=ttl)
         record = Record(f"{self.boot}-{number}", number, asked, sender, now.wall, self._may_preempt(say), expires_at)
         record.first_chars = len(say.text)
-        by = canceled or self._early_cancels.find(say.id, now.monotonic)
-        refused = self._find_refusal(say, refusal, first) or (None if canceled else self._throttle(say, record, now))
+        by = canceler or self._early_cancels.find(say.id, now.monotonic)
+        refused = self._find_refusal(say, refusal, first) or (None if canceler else self._find_repeat(say, record, now))
         expired = expires_at <= now.monotonic
         recalled = self._find_room(say)
         if recalled is None and not (by or refused or expired):
@@ -231,7 +231,7 @@ class Scheduler:
         effects: list[Effect] = [StateChange(record, State.PENDING)]
         if by:
             words = (
-                "the goal was cancelled before it started" if canceled else "the goal was cancelled before it arrived"
+                "the goal was cancelled before it started" if canceler else "the goal was cancelled before it arrived"
             )
             return record, effects + self._end_unqueued(record, Reason.CANCELED, words, by, now)
         if expired:
@@ -242,21 +242,21 @@ class Scheduler:
         return record, effects + self._start_next(now) + self._order_next_voice(now)
 
     def cancel(
-        self, selection: Cancel, sender: Sender | None, now: Now, waiting: Collection[str | None] = ()
+        self, selection: Cancel, sender: Sender | None, now: Now, waiting_ids: Collection[str | None] = ()
     ) -> Cancellation:
-        """Cancel the selected goals, and remember cancels for unknown ids.
+        """Cancel the selected goals, remember cancels for unknown ids, and return the result.
 
-        Pending goals end at once. The active goal ends when the engine is silent. The result contains the effects.
+        Pending goals end at once. The active goal ends when the engine is silent.
 
         Args:
             selection: the goals to cancel.
             sender: the client that cancels the goals.
             now: the current time.
-            waiting: ids of selected goals that still wait for room in the queue.
+            waiting_ids: ids of selected goals that still wait for room in the queue.
         """
         result = Cancellation()
         by = By(client=sender)
-        chosen = self._select(selection, result, waiting)
+        chosen = self._select(selection, result, waiting_ids)
         for goal_id in filter(options.is_clients_id, result.unknown):
             self._early_cancels.add(goal_id, by, now.monotonic)
         for record in chosen:
@@ -272,9 +272,9 @@ class Scheduler:
         return result
 
     def append(self, record: Record, addition: Append, now: Now) -> list[Effect]:
-        """Add text to a growing text, or end it.
+        """Add text to a goal or mark its text as complete, and return the effects.
 
-        An addition that was sent before changes nothing. Return the effects.
+        An addition that was sent before changes nothing.
 
         Args:
             record: the goal.
@@ -302,17 +302,17 @@ class Scheduler:
             return []
         if refused := options.bad_characters(added, self.max_text * options.GROWTH_FACTOR, len(text)):
             raise RequestRefused(refused[1], refused[0])
-        self._adopt(record)
+        self._stop_awaiting_sender(record)
         record.say, record.more = replace(record.say, text=text + added), not addition.end
-        self._restart_stall(record, now)
+        self._reset_stall_limit(record, now)
         if addition.broken:
             return self.break_off(record, now, at_once=True)
         return [EngineOrder(record, Order.APPEND)] if record.state is State.ACTIVE and (added or addition.end) else []
 
     def producer_left(self, record: Record, now: Now) -> list[Effect]:
-        """Break off a text whose sender has left.
+        """Break off a text whose sender has left, or wait for a new connection first.
 
-        If the sender chose the goal's id, wait for a new connection first. Return the effects.
+        Wait only if the sender chose the goal's id. Return the effects.
         """
         if not record.more or record.say.id is None:
             return self.break_off(record, now)
@@ -322,11 +322,11 @@ class Scheduler:
         return []
 
     def break_off(self, record: Record, now: Now, *, at_once: bool = False) -> list[Effect]:
-        """End a goal whose text will never be complete.
+        """End a goal whose text stays incomplete, at once or after its complete sentences.
 
-        Complete sentences are still spoken, unless `at_once` is set. Return the effects.
+        A goal that hasn't started always ends at once. Return the effects.
         """
-        self._adopt(record)
+        self._stop_awaiting_sender(record)
         if not (record.more and record.state in {State.PENDING, State.ACTIVE}):
             return []
         if record.state is State.PENDING:
@@ -335,9 +335,9 @@ class Scheduler:
         return self._stop(record, Reason.BROKEN_OFF, None, now) if at_once else [EngineOrder(record, Order.APPEND)]
 
     def change_settings(self, changes: dict[str, object], now: Now) -> list[Effect]:
-        """Change the settings for goals that have not started.
+        """Change the settings for goals that have not started, and return the effects.
 
-        Return the effects. A new voice that failed to load earlier is loaded again.
+        A new voice that failed to load earlier is loaded again.
         """
         self.settings = replace(self.settings, **changes)
         voice = changes.get("voice")
@@ -347,9 +347,9 @@ class Scheduler:
         return self.tick(now)  # the next goal may not have to wait for its voice any more
 
     def pause(self) -> list[Effect]:
-        """Pause the active goal, and prevent others from starting.
+        """Pause the active goal, and let no goal start until `resume` is called.
 
-        The pause lasts until `resume` is called.
+        Return the effects.
         """
         if self.paused:
             return []
@@ -368,13 +368,13 @@ class Scheduler:
         if not (self.active and self.active.paused):
             return self._start_next(now)
         self.active.paused = False
-        self._restart_stall(self.active, now)
+        self._reset_stall_limit(self.active, now)
         return [EngineOrder(self.active, Order.RESUME)]
 
     def shutdown(self, now: Now) -> list[Effect]:
-        """End all pending goals, and reject new ones.
+        """End all pending goals, stop the active one, and reject new ones.
 
-        The returned effects also stop the active goal.
+        Return the effects.
         """
         self.closing = True
         effects: list[Effect] = []
@@ -387,9 +387,9 @@ class Scheduler:
     # -- reports from the engine
 
     def engine_lost(self, now: Now) -> list[Effect]:
-        """Record that the engine process has exited.
+        """Record that the engine process has exited, and return warnings about voices.
 
-        No goal starts until a new engine is ready. Return warnings about voices.
+        No goal starts until a new engine is ready.
         """
         self.has_engine = self._loads_voices = False
         return [*self.voices.engine_lost(now.monotonic)]
@@ -405,9 +405,9 @@ class Scheduler:
         return self._start_next(now) + self._order_next_voice(now)
 
     def engine_unavailable(self, now: Now) -> list[Effect]:
-        """Record that no engine can be started.
+        """Record that no engine can be started, so that goals fail instead of waiting.
 
-        From now on, goals fail at once instead of waiting. Return the effects.
+        Return the effects, which start the next goal.
         """
         self.has_engine, self._loads_voices = True, False
         return self._start_next(now)
@@ -444,7 +444,7 @@ class Scheduler:
         self.audio_heard(goal_id, seconds)
 
     def audio_heard(self, goal_id: str, seconds: float) -> None:
-        """Record how many seconds of the active goal's audio were heard."""
+        """Record how many seconds of the active goal's audio were heard so far."""
         record = self._require_active(goal_id)
         record.heard = max(record.heard, seconds)
 
@@ -454,7 +454,7 @@ class Scheduler:
         record.waits = missing
         if missing:
             record.spoken_end = record.begun_end
-        self._restart_stall(record, now)
+        self._reset_stall_limit(record, now)
 
     def voice_chosen(self, goal_id: str, voice: str, now: Now) -> list[Effect]:
         """Record which voice speaks the active goal.
@@ -474,9 +474,9 @@ class Scheduler:
     def completed(
         self, goal_id: str, duration: float | None, now: Now, gaps: int = 0, gap_seconds: float = 0
     ) -> list[Effect]:
-        """End the active goal as SUCCEEDED, because it was played to the end.
+        """End the active goal after it was played to the end, usually as SUCCEEDED.
 
-        Return the effects.
+        It ends as ABORTED if its text broke off. Return the effects.
 
         Args:
             goal_id: the id of the goal.
@@ -515,9 +515,9 @@ class Scheduler:
         return self._end(record, State.ABORTED, reason, f"speech failed: {message}", record.by, now)
 
     def stopped(self, goal_id: str, now: Now) -> list[Effect]:
-        """End the active goal as PREEMPTED, because it was stopped and is silent.
+        """End the stopped goal as PREEMPTED, or as ABORTED if its text was incomplete.
 
-        If it was stopped because its text is incomplete, it ends as ABORTED. Return the effects.
+        The engine has confirmed that the goal is silent. Return the effects.
         """
         record = self._require_active(goal_id)
         if record.reason in {Reason.BROKEN_OFF, Reason.TEXT_STALLED}:
@@ -527,9 +527,9 @@ class Scheduler:
         return self._end(record, State.PREEMPTED, record.reason, "Talk preempted", record.by, now)
 
     def voice_load_ended(self, voice: str, error: str | None, now: Now, *, has_libraries: bool) -> list[Effect]:
-        """Record that loading a voice succeeded or failed.
+        """Record that loading a voice succeeded or failed, and start a goal that waited for it.
 
-        Return the effects, such as starting a waiting goal.
+        Return the effects.
 
         Args:
             voice: the id of the voice.
@@ -542,9 +542,9 @@ class Scheduler:
         return self._order_voice_drops() + self.tick(now)
 
     def voices_measured(self, voice: str, memory_bytes: int, now: Now) -> list[Effect]:
-        """Record how much memory all neural voices use.
+        """Record how much memory all neural voices use, and order voices to be dropped or loaded.
 
-        Return the orders to drop or load voices.
+        Return the orders.
 
         Args:
             voice: the voice that was just loaded or has just spoken, or "" if a voice was dropped.
@@ -555,9 +555,9 @@ class Scheduler:
         return self._order_voice_drops() + self._order_next_voice(now)
 
     def voice_unloaded(self, voice: str, now: Now) -> list[Effect]:
-        """Record that the engine dropped a voice on its own.
+        """Record that the engine dropped a voice on its own, and order the next voice to load.
 
-        Return the order to load the next voice, if any.
+        Return the order, if any.
         """
         self.voices.unloaded(voice, self._needed_voices())
         return self._order_next_voice(now)
@@ -565,15 +565,12 @@ class Scheduler:
     # -- time limits
 
     def deadline(self) -> float:
-        """Return the monotonic time at which `tick` must be called next.
-
-        Return inf if there is no time limit.
-        """
+        """Return the monotonic time at which `tick` must be called next, or inf for never."""
         orphans = min((each.orphaned_until for each in self._orphans), default=inf)
         return min(self._active_deadline(), self.pending.next_expiry(), self._next_deadline(), orphans)
 
     def tick(self, now: Now) -> list[Effect]:
-        """Handle all time limits that have been reached.
+        """Handle all time limits that have been reached, and return the effects.
 
         Expired goals are recalled. If the active goal was stopped and did not become silent in time, it is aborted. The
         next goal starts if it no longer has to wait for its voice.
@@ -596,7 +593,7 @@ class Scheduler:
 
     # -- selecting and accepting goals
 
-    def _select(self, selection: Cancel, result: Cancellation, waiting: Collection[str | None]) -> list[Record]:
+    def _select(self, selection: Cancel, result: Cancellation, waiting_ids: Collection[str | None]) -> list[Record]:
         """Return the unfinished goals that a cancel selects, and record ended and unknown ones in `result`."""
         chosen = self.unfinished() if selection.selects_all else []
         for goal_id in dict.fromkeys(selection.ids or ()):
@@ -605,7 +602,7 @@ class Scheduler:
                 result.ended.append(record)
             elif record:
                 chosen.append(record)
-            elif goal_id not in waiting:
+            elif goal_id not in waiting_ids:
                 result.unknown.append(goal_id)
         if self.active and (selection.current or self.active.say.key == selection.key is not None):
             chosen.append(self.active)
@@ -613,7 +610,7 @@ class Scheduler:
             chosen.append(pending)
         if selection.before is not None:
             last = self.find(selection.before)
-            if last or selection.before in waiting:
+            if last or selection.before in waiting_ids:
                 chosen += [each for each in self.unfinished() if last is None or each.number <= last.number]
             else:
                 result.unknown.append(selection.before)
@@ -621,7 +618,7 @@ class Scheduler:
         # Cancel the active goal last. Otherwise, another selected goal could start before it is recalled.
         return sorted(unique, key=lambda each: (each is self.active, each.number))
 
-    def _find_refusal(self, say: Say, refusal: Refusal | None, same_id: Record | None) -> Refusal | None:
+    def _find_refusal(self, say: Say, refusal: Refusal | None, conflicting: Record | None) -> Refusal | None:
         """Return the reason why a goal must be rejected, if there is one.
 
         The state of the queue doesn't matter.
@@ -629,21 +626,21 @@ class Scheduler:
         Args:
             say: the goal.
             refusal: the server's own reason to reject the goal, or None.
-            same_id: an earlier goal with the same id and another text, or None.
+            conflicting: an earlier goal with the same id and another text, or None.
         """
         if self.closing:
             return Reason.SHUTDOWN, "the server is stopping"
         if words := options.bad_option(say):
             return Reason.BAD_OPTION, words
-        if same_id is not None:
+        if conflicting is not None:
             return Reason.ID_CONFLICT, f"the id {say.id} was already used for another text"
         limit = self.max_text * options.GROWTH_FACTOR if say.more else self.max_text
         return options.bad_text(say.text, limit) or refusal
 
-    def _throttle(self, say: Say, record: Record, now: Now) -> Refusal | None:
-        """Return a refusal if a goal repeats another one too soon.
+    def _find_repeat(self, say: Say, record: Record, now: Now) -> Refusal | None:
+        """Return a refusal if a goal repeats another one within its `throttle` time.
 
-        If the goal is rejected, `record.by` is set to the other goal.
+        In this case, also set `record.by` to the other goal.
         """
         if say.throttle is None:
             return None
@@ -667,7 +664,7 @@ class Scheduler:
         return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)
 
     def _find_room(self, say: Say) -> list[tuple[Record, Reason]] | None:
-        """Return the goals that a new goal would remove from the queue."""
+        """Return the goals to remove for a new goal, with reasons, or None if there is no room."""
         replaced = self.pending.with_key(say.key)
         preempted: list[Record] = []
         if say.flush:
@@ -684,15 +681,15 @@ class Scheduler:
         limit = say.priority if say.preempt else say.priority - 1
         return [(last, Reason.DISPLACED)] if last and last.say.priority <= limit else None
 
-    def _enqueue(self, record: Record, recalled: list[tuple[Record, Reason]], now: Now) -> list[Effect]:
-        """Add a goal to the queue, and recall the given goals.
+    def _enqueue(self, record: Record, to_recall: list[tuple[Record, Reason]], now: Now) -> list[Effect]:
+        """Add a goal to the queue, recall the given goals, and stop a preempted active goal.
 
-        The returned effects stop a preempted active goal.
+        Return the effects.
         """
         by = By(goal=record.id)
         effects: list[Effect] = []
         replaced = None
-        for each, reason in recalled:
+        for each, reason in to_recall:
             if reason is Reason.REPLACED and each.say.priority == record.say.priority and not record.preempt:
                 replaced = each
             effects += self._recall(each, reason, f"it was {reason} by goal {record.id}", by, now)
@@ -704,7 +701,7 @@ class Scheduler:
     # -- voices
 
     def _request_voice(self, voice: str, now: Now) -> None:
-        """Request a voice for a goal, if it is neural and an engine process is running."""
+        """Plan to load a voice for a goal, if it is neural and an engine process is running."""
         if self._loads_voices and options.is_neural(model := options.without_speaker(voice)):
             self.voices.request(model, now.monotonic)
 
@@ -718,10 +715,10 @@ class Scheduler:
         return list(filter(options.is_neural, dict.fromkeys(voices)))
 
     def _order_next_voice(self, now: Now) -> list[Effect]:
-        """Choose the next voice to load, and mark it as loading.
+        """Mark the next voice as loading, and return a list with the order, if any.
 
-        Return a list with the order, if any. The first voice is not loaded while a goal is active. Loading it imports
-        libraries, which blocks the engine process for a tenth of a second.
+        The first voice is not loaded while a goal is active. Loading it imports libraries, which blocks the engine
+        process for a tenth of a second.
         """
         if not (self._loads_voices and self.voices.can_load) or self.closing:
             return []
@@ -733,7 +730,7 @@ class Scheduler:
         return [order] if order else []
 
     def _order_voice_drops(self) -> list[Effect]:
-        """Drop voices if they use too much memory, and return the orders."""
+        """Choose voices to drop if they use too much memory, and return the orders and warnings."""
         needed = self._needed_voices()
         speaking = options.without_speaker(self.active.voice) if self.active else ""
         if options.is_neural(speaking) and not self.voices.is_loaded(speaking):
@@ -786,10 +783,9 @@ class Scheduler:
         return [*effects, EngineOrder(record, Order.START)] if record else effects
 
     def _activate_next(self, now: Now) -> tuple[Record | None, list[Effect]]:
-        """Make the next goal ACTIVE if possible.
+        """Make the next goal ACTIVE if possible, and return it or None, with the effects.
 
-        Return it, and the effects without the order to speak it. Return None instead of a goal if no goal can start
-        now.
+        The effects don't contain the order to speak the goal.
         """
         if self.active or self.paused:
             return None, []
@@ -817,7 +813,10 @@ class Scheduler:
         return self._end(record, State.RECALLED, reason, f"not spoken: {details}", by, now)
 
     def _stop(self, record: Record, reason: Reason, by: By | None, now: Now) -> list[Effect]:
-        """Stop the active goal, unless it is already being stopped."""
+        """Mark the active goal as being stopped, and return the order to stop it.
+
+        Return no effects if it is already being stopped.
+        """
         if record.state is State.PREEMPTING:
             return []  # keep the reason for the first stop
         record.change_state(State.PREEMPTING)
@@ -825,18 +824,18 @@ class Scheduler:
         record.paused = False
         return [StateChange(record, State.PREEMPTING), EngineOrder(record, Order.STOP)]
 
-    def _adopt(self, record: Record) -> None:
-        """Stop waiting for a connection that continues the text of a goal."""
+    def _stop_awaiting_sender(self, record: Record) -> None:
+        """Stop waiting for a new connection to continue the text of a goal."""
         if record in self._orphans:
             self._orphans.remove(record)
         record.orphaned_until = inf
 
-    def _restart_stall(self, record: Record, now: Now) -> None:
-        """Restart the sender's time limit if text is missing."""
+    def _reset_stall_limit(self, record: Record, now: Now) -> None:
+        """Restart the time limit for more text if a goal waits for text, or else remove it."""
         record.stalls_at = now.monotonic + record.say.stall if record.waits else inf
 
     def _require_active(self, goal_id: str) -> Record:
-        """Return the active goal, which must have this id."""
+        """Return the active goal, or raise IllegalTransition if it has another id."""
         if self.active is None or self.active.id != goal_id:
             raise IllegalTransition(f"goal {goal_id} is not being spoken")
         return self.active
@@ -844,14 +843,14 @@ class Scheduler:
     def _end(
         self, record: Record, state: State, reason: Reason | None, message: str, by: By | None, now: Now
     ) -> list[Effect]:
-        """Set a goal's final state, and move it to the history.
+        """End a goal in this state, move it to the history, and start the next one.
 
-        Return the effects, such as starting the next goal.
+        Return the effects.
         """
         record.change_state(state)
         record.reason, record.message, record.by = reason, message, by
         record.ended_at, record.paused, record.more, record.waits = now.wall, False, False, False
-        self._adopt(record)
+        self._stop_awaiting_sender(record)
         if record.begun_end and state is not State.ABORTED:
             self._speech_times.add(record)
         self._by_id.pop(record.id)

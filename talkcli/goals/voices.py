@@ -168,7 +168,7 @@ class VoiceScheduler:
         return self._loading is None and any(each.wanted for each in self._voices.values())
 
     def load_next(self, needed: Sequence[str], default_voice: str, now: float) -> VoiceLoadOrder | None:
-        """Choose the next voice to load, and return the order.
+        """Mark the next voice as loading, and return the order to load it.
 
         Return None if no voice can be loaded now. Call this only if `can_load` is true. A loaded voice is not dropped
         if a goal needs it sooner than the next voice, because it would have to be loaded again.
@@ -196,14 +196,13 @@ class VoiceScheduler:
         self._forget_unneeded((*needed, default_voice))
         return None
 
-    def drop_excess(self, first: str, needed: Sequence[str]) -> list[VoiceDropOrder | VoiceWarning]:
-        """Choose the voices to drop to meet the memory limit.
+    def drop_excess(self, kept_voice: str, needed: Sequence[str]) -> list[VoiceDropOrder | VoiceWarning]:
+        """Choose the voices to drop to meet the memory limit, and return orders and warnings.
 
-        Return the orders to drop them, and any warnings. This is necessary if the voices use more memory than was
-        estimated.
+        This is necessary if the voices use more memory than was estimated.
 
         Args:
-            first: the voice that speaks now or next. It is never dropped.
+            kept_voice: the voice that speaks now or next. It is never dropped.
             needed: the voices that waiting goals need, in the order of the goals. They are dropped last.
         """
         loaded = self._loaded_bytes()
@@ -212,7 +211,7 @@ class VoiceScheduler:
         dropped: list[str] = []
         total = self._total_bytes()
         for each in order:
-            if total > self._limit_bytes and each != first and len(dropped) < len(loaded) - 1:
+            if total > self._limit_bytes and each != kept_voice and len(dropped) < len(loaded) - 1:
                 total -= loaded[each]
                 dropped.append(each)
         for each in dropped:
@@ -249,10 +248,7 @@ class VoiceScheduler:
             self._measured_bytes[voice] = found.size_bytes
 
     def unloaded(self, voice: str, needed: Collection[str]) -> None:
-        """Record that the engine has dropped a voice.
-
-        If a goal needs it, plan to load it again.
-        """
+        """Record that a voice was dropped, and plan to load it again if a goal needs it."""
         found = self._voices.pop(voice, None)
         if found and found.state is VoiceState.LOADED:
             self._used_bytes = max(0, self._used_bytes - found.size_bytes)  # estimated until the next measurement
@@ -260,7 +256,7 @@ class VoiceScheduler:
             self._voices[voice] = NeuralVoice(found.size_bytes)
 
     def engine_lost(self, now: float) -> list[VoiceWarning]:
-        """Record that the engine process has exited, and warn if a voice is the likely cause."""
+        """Record that the engine process has exited. Return a warning if a voice is the cause."""
         suspect, self._loading, self.has_libraries = self._loading, None, False
         self._reported_bytes = self._used_bytes = 0
         for voice, found in list(self._voices.items()):
@@ -288,9 +284,9 @@ class VoiceScheduler:
         return max(self._used_bytes, sum(self._loaded_bytes().values()))
 
     def _voices_to_drop(self, size_bytes: int, keep: Collection[str]) -> tuple[str, ...] | None:
-        """Return the voices to drop to make room for a new one.
+        """Return the voices to drop to make room for a new one, or None if it can't fit.
 
-        Return None if it can't fit. The least recently used voices are dropped first.
+        The least recently used voices are dropped first.
 
         Args:
             size_bytes: the memory use of the new voice.
@@ -305,7 +301,7 @@ class VoiceScheduler:
         return None if keep and total > self._limit_bytes else tuple(dropped)
 
     def _warn_too_large(self) -> list[VoiceWarning]:
-        """Return a warning if the only loaded voice exceeds the memory limit."""
+        """Return a warning the first time that a single loaded voice exceeds the memory limit."""
         loaded = self._loaded_bytes()
         voice = next(iter(loaded), "")
         taken = self._total_bytes()

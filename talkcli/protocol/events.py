@@ -247,10 +247,7 @@ def _event_json(kind: str, event: StateChanged | WordHeard | TextAdded | TextMis
 
 
 def goals(items: list[JsonObject], name: str) -> Iterator[Goal]:
-    """Yield the goals in the given field of list items.
-
-    Raises Unreadable if a goal is malformed.
-    """
+    """Yield the goals in this field of list items, or raise Unreadable."""
     return (Goal.from_json(each[name]) for each in items if name in each)
 
 
@@ -262,9 +259,9 @@ def goal_in(reply: JsonObject, name: str = "goal") -> Goal | None:
     return None if reply.get(name) is None else Goal.from_json(reply[name])
 
 
-def greeting(version: str, pid: int, boot: str) -> JsonObject:
+def greeting(version: str, pid: int, boot_id: str) -> JsonObject:
     """Return the greeting, which is the first message that a server sends."""
-    return {"talk": PROTOCOL, "version": version, "pid": pid, "boot": boot, "features": list(FEATURES)}
+    return {"talk": PROTOCOL, "version": version, "pid": pid, "boot": boot_id, "features": list(FEATURES)}
 
 
 def busy_greeting(message: str | None = None) -> JsonObject:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 MAX_LINE_BYTES = 64 * 1024
 
 #: The number of the first request on a connection.
-FIRST_NUMBER = 1
+FIRST_SEQ = 1
 
 #: Maximum number of digits in a JSON integer. Converting thousands of digits would take quadratic time.
 MAX_DIGITS = 20
@@ -82,7 +82,7 @@ class LineSplitter:
         self._rest += data[: self._max_bytes - len(self._rest)]
 
 
-def write_request(request: Request) -> JsonObject:
+def request_to_json(request: Request) -> JsonObject:
     """Return a request's JSON object, without the default values."""
     message: JsonObject = {"request": request.kind}
     for option in request.options:

@@ -147,12 +147,9 @@ REQUEST_TYPES: dict[str, type[Request]] = {each.kind: each for each in Request._
 
 
 def read_request(message: JsonObject) -> Request:
-    """Check a JSON object, and return the request in it.
+    """Return the request in a JSON object, or raise BadRequest if it is malformed.
 
     The caller must have removed `seq` from the object.
-
-    Raises:
-        BadRequest: the request is malformed.
     """
     fields = dict(message)
     kind = fields.pop("request", None)

@@ -98,7 +98,7 @@ class PendingRequest:
         self._steps: Steps
 
     def start(self, steps: Steps) -> None:
-        """Run the coroutine until it waits or ends.
+        """Run the coroutine `steps`, which handles the request, until it waits or ends.
 
         It must answer the request and must not raise.
         """
@@ -115,7 +115,7 @@ class PendingRequest:
                 timer.cancel()
 
     def resume(self, in_time: bool = True) -> None:
-        """Continue the request if it is waiting."""
+        """Continue the request if it is waiting. Its `wait` returns `in_time`."""
         if self._leave():
             self._step(in_time)
 
@@ -159,13 +159,16 @@ class PendingRequest:
         else:
             self.connection.send(reply)
 
-    def _step(self, value: bool | None) -> None:
-        """Continue the coroutine until it waits in a list or ends."""
+    def _step(self, in_time: bool | None) -> None:
+        """Continue the coroutine until it waits in a list or ends.
+
+        The call that it waits in returns `in_time`, which is None at the start.
+        """
         with contextlib.suppress(StopIteration):  # raised when the coroutine has ended
-            self.move_to(self._steps.send(value))
+            self.move_to(self._steps.send(in_time))
 
     def _leave(self) -> bool:
-        """Remove the request from its waiting list, if it is waiting."""
+        """Remove the request from its waiting list, and return whether it was in one."""
         if self.waiting_list is None:
             return False
         del self.waiting_list[self]
@@ -181,15 +184,12 @@ def resume_all(waiting_list: WaitingList) -> None:
 
 @coroutine
 def _wait_in(waiting_list: WaitingList) -> Generator[WaitingList, bool, bool]:
-    """Suspend a request's coroutine until it is resumed from this list.
-
-    Return whether that was in time.
-    """
+    """Suspend a request's coroutine in this list, and return whether it was resumed in time."""
     return (yield waiting_list)
 
 
 class ClientConnection(asyncio.Protocol):
-    """The connection of one client.
+    """A client's connection, which reads its requests and sends replies and events.
 
     If the server is full, a new client is admitted only when another client leaves, or when it sends an urgent request.
     """
@@ -239,7 +239,7 @@ class ClientConnection(asyncio.Protocol):
     # -- called by the stream
 
     def connection_lost(self, error: Exception | None) -> None:
-        """Remove the client from the server after its connection has ended."""
+        """Process the last requests of a disconnected client, and remove it from the server."""
         self._first_limit.cancel()
         self._cancel_line_limit()
         if error is not None and self.admitted:
@@ -297,9 +297,9 @@ class ClientConnection(asyncio.Protocol):
         self._schedule_work()
 
     def publish(self, event: bytes, *, feedback: bool = False) -> None:
-        """Send an encoded event.
+        """Send an encoded event, but hold back feedback if the client reads too slowly.
 
-        If the client reads too slowly, only the newest feedback is kept.
+        Only the newest held feedback is kept.
         """
         if feedback and self.stream.congested:
             self._held_feedback = event
@@ -318,7 +318,7 @@ class ClientConnection(asyncio.Protocol):
         self.stream.close()
 
     def finish(self) -> None:
-        """Finish all answers, and then close the connection."""
+        """Read no more requests, finish all answers, and then close the connection."""
         self._finishing = True
         self._schedule_work()
 
@@ -329,10 +329,9 @@ class ClientConnection(asyncio.Protocol):
         return self._loop.call_later(seconds, self.close_with, failure(None, "too_slow", message))
 
     def _update_reading(self) -> None:
-        """Start or stop reading from the client.
+        """Start or stop reading, and the time limit for receiving a whole line.
 
-        Also start or cancel the time limit for an incomplete line. The server reads only while the client reads its
-        replies and has few unprocessed lines.
+        The server reads only while the client reads its replies and has few unprocessed lines.
         """
         if self.stream.closing:
             return
@@ -370,7 +369,7 @@ class ClientConnection(asyncio.Protocol):
             self._process_line(self._lines.popleft())
 
     def _work(self) -> None:
-        """Send output and process requests, up to a limit for each iteration."""
+        """Send some output, process some requests, and close the connection if it is done."""
         for _ in range(LINES_PER_TURN):
             if self.stream.closing or self.stream.congested or not self._send_or_process_one():
                 break
@@ -395,7 +394,7 @@ class ClientConnection(asyncio.Protocol):
         self._work()
 
     def _send_or_process_one(self) -> bool:
-        """Send one line or process one request, if there is anything to do."""
+        """Send one line or process one request. Return False if there was nothing to do."""
         if self._outbox:
             first = self._outbox[0]
             if isinstance(first, bytes):

@@ -32,10 +32,10 @@ MAX_BACKLOG_CONNECTIONS = 1024
 #: How long to wait until another server has written its process id to the lock file.
 HOLDER_ID_S = 1.0
 #: The first file descriptor passed by systemd (SD_LISTEN_FDS_START).
-_FIRST_PASSED = 3
+_FIRST_PASSED_FD = 3
 _RESTART_SOCKET = "restart it with: systemctl restart talk.socket"
 #: Errors that may be temporary: not enough memory, disk space or file descriptors, or a read-only file system.
-_TEMPORARY = {errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOBUFS, errno.ENOSPC, errno.EDQUOT, errno.EROFS}
+_TEMPORARY_ERRORS = {errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOBUFS, errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 
 
 class Listener:
@@ -71,9 +71,7 @@ class Listener:
         return _identity(self.path) == self._identity and _is_lock_of(self.path, self._lock)
 
     def bind_again(self) -> socket.socket | None:
-        """Recreate a missing socket file or lock file.
-
-        Return the old socket if the caller must close it.
+        """Recreate a missing socket or lock file, and return a replaced socket, if any.
 
         Returns:
             The old socket, which the caller must close, or None if it is still in use.
@@ -140,9 +138,9 @@ class InheritedListener:
 
 
 def listen(path: str | None, mode: int) -> Listener | InheritedListener:
-    """Return the listening socket passed by systemd if it has this path.
+    """Return the listening socket passed by systemd, or bind a new one at this path.
 
-    Otherwise, bind a new socket.
+    The passed socket is used only if it has this path.
 
     Args:
         path: the path of the socket file, or None for any passed socket, or else the usual place.
@@ -152,7 +150,7 @@ def listen(path: str | None, mode: int) -> Listener | InheritedListener:
     if passed and os.environ.get("LISTEN_PID") == str(os.getpid()):
         if passed != "1":
             raise UsageError(f"systemd passed {passed} sockets (LISTEN_FDS), but talk can serve only one")
-        inherited = InheritedListener(_FIRST_PASSED)
+        inherited = InheritedListener(_FIRST_PASSED_FD)
         if not path or paths.server_socket(path) == inherited.path:
             return inherited
         inherited.close()
@@ -161,7 +159,7 @@ def listen(path: str | None, mode: int) -> Listener | InheritedListener:
 
 def is_temporary(error: AddressInUse) -> bool:
     """Return whether another attempt to bind the socket may succeed."""
-    return isinstance(error.__cause__, OSError) and error.__cause__.errno in _TEMPORARY
+    return isinstance(error.__cause__, OSError) and error.__cause__.errno in _TEMPORARY_ERRORS
 
 
 @contextlib.contextmanager
@@ -182,13 +180,13 @@ def _identity(path: str) -> tuple[int, int] | None:
     return status.st_dev, status.st_ino
 
 
-def _already_served(pid: int | None, path: str, *, here: bool) -> AddressInUse:
+def _already_served(pid: int | None, path: str, *, on_this_machine: bool) -> AddressInUse:
     """Return an error saying that another server uses the path.
 
-    `here` is true if that server runs on this machine.
+    `pid` is the id of its process, if known. It can be killed only on this machine.
     """
     name = "unknown" if pid is None else pid
-    stop = f"with: kill {pid}" if here else "first"
+    stop = f"with: kill {pid}" if on_this_machine else "first"
     return AddressInUse(f"a server (pid {name}) is already running at {path}; use it, or stop it {stop}")
 
 
@@ -196,10 +194,9 @@ def _already_served(pid: int | None, path: str, *, here: bool) -> AddressInUse:
 
 
 def _path_of(passed: socket.socket) -> str:
-    """Return the path of a listening Unix socket.
+    """Return the path of a socket passed by systemd, or raise UsageError if it has none.
 
-    Raises:
-        UsageError: if the socket is of another type, or has no path.
+    It must be a listening Unix socket.
     """
     if passed.family != socket.AF_UNIX:
         raise UsageError("the socket from systemd (LISTEN_FDS) is not a Unix socket; use ListenStream=/path")
@@ -225,7 +222,7 @@ def _refuse_second_server(path: str | None) -> None:
     here, _ = peers.credentials(found.socket)  # this is the process id of ssh if ssh forwards the socket
     found.socket.close()
     pid = found.server.pid if found.server else None
-    raise _already_served(pid, found.path, here=here == pid)
+    raise _already_served(pid, found.path, on_this_machine=here == pid)
 
 
 def _refuse_live_socket(path: str) -> None:
@@ -283,7 +280,7 @@ def _refuse_other_file(path: str) -> None:
 
 
 def _bind(path: str, mode: int) -> socket.socket:
-    """Create a socket at the path, after removing an old socket file.
+    """Return a new socket that listens at the path, after removing an old socket file.
 
     The caller must hold the lock.
     """
@@ -303,12 +300,9 @@ def _bind(path: str, mode: int) -> socket.socket:
 
 
 def _acquire_lock(path: str) -> int:
-    """Lock a socket's path, and return the lock file's descriptor.
+    """Lock a socket's path, or raise AddressInUse if another server has locked it.
 
-    The lock lasts until the descriptor is closed.
-
-    Raises:
-        AddressInUse: if another server holds the lock.
+    Return the descriptor of the lock file, which contains this process's id. Closing the descriptor ends the lock.
     """
     while True:
         fd = _open_lock(f"{path}.lock")
@@ -316,7 +310,7 @@ def _acquire_lock(path: str) -> int:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             holder = _read_holder(fd)
-            raise _already_served(holder, path, here=holder is not None) from None
+            raise _already_served(holder, path, on_this_machine=holder is not None) from None
         if _is_lock_of(path, fd):
             break
         os.close(fd)  # the file was removed before it was locked, so try again
@@ -374,7 +368,7 @@ def _process_exists(pid: int) -> bool:
 
 
 def _read_holder(fd: int) -> int | None:
-    """Wait for the process id in the lock file, and return it.
+    """Wait briefly for a server's process id in its lock file, and return it, if any.
 
     The id of a process that no longer exists was written by an earlier server, and is ignored.
     """

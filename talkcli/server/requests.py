@@ -143,9 +143,9 @@ class Requests:
             each.resume()
 
     def _reserve_memory(self, pending: PendingRequest) -> bool:
-        """Reserve memory for a waiting request.
+        """Count a waiting request's memory. If too many wait, set `refusal` and return False.
 
-        If too many wait, set its refusal and return False.
+        The request is then carried out without waiting, and the refusal rejects its goal.
         """
         if pending.kept_bytes:
             return True  # the request has waited before
@@ -194,9 +194,9 @@ class Requests:
         return [each for each in selected if not each.connection.detect_hang_up()]
 
     def _cancel_waiting(self, goals: list[PendingRequest], by: By | None) -> list[Callable[[], None]]:
-        """Mark waiting goals as cancelled.
+        """Mark waiting goals as cancelled, and return functions that end them.
 
-        Return functions that submit them to the scheduler. The scheduler then recalls them like other goals.
+        The functions submit the goals to the scheduler, which recalls them.
         """
         new = [each for each in goals if each.waiting_list is not self._speech.canceled_goals]
         for each in new:
@@ -205,10 +205,7 @@ class Requests:
         return [each.resume for each in new]
 
     async def _await_room(self, pending: PendingRequest, say: Say) -> float:
-        """Wait until the queue has room or the goal has expired.
-
-        Return the waiting time in seconds.
-        """
+        """Wait until the queue has room or the goal expires, and return the waiting time."""
         ttl = (self._scheduler.settings.ttl if say.ttl is None else say.ttl) or None
         began = self._speech.advance_time().monotonic
         self._speech.subscribers.schedule_keep_alive()
@@ -219,9 +216,9 @@ class Requests:
     # -- coroutines, named after the requests that they handle
 
     async def _say(self, pending: PendingRequest, say: Say) -> None:
-        """Submit a goal and reply.
+        """Submit a goal, which first waits for room if it is `patient`, and reply.
 
-        If the queue is full, a `patient` goal first waits for room.
+        The reply shows the goal as it was accepted.
         """
         speech, scheduler, connection = self._speech, self._scheduler, pending.connection
         waited = 0.0
@@ -280,9 +277,7 @@ class Requests:
         pending.answer(length=len(record.say.text), state=record.state.name)
 
     def _require_producer(self, record: Record, connection: ClientConnection) -> None:
-        """Record which connection adds text to a goal.
-
-        Raises RequestRefused if another connection already does.
+        """Let a connection add text to a goal, or raise RequestRefused if another one does.
 
         A new connection may continue a text if the old one is gone and the sender chose the goal's id.
         """
@@ -298,20 +293,19 @@ class Requests:
         return producer is None or producer.detect_hang_up()
 
     def _check_goal(self, pending: PendingRequest, say: Say) -> tuple[Say, Refusal | None]:
-        """Fill in the id of a goal's voice.
+        """Return a goal with the id of its voice, and the reason to refuse it, if any.
 
-        Return the new goal, and the reason to refuse it, if any. Refusals that need a clock, files or other I/O belong
-        here. The scheduler decides about all others.
+        Refusals that need a clock, files or other I/O belong here. The scheduler decides about all others.
         """
         voice, refusal = self._speech.voices.look_up(say.voice, self._scheduler.settings.voice)
         say = replace(say, voice=voice)
-        if say.pitch not in {None, options.INITIAL.pitch} and options.is_neural(voice or ""):
+        if say.pitch not in {None, options.DEFAULTS.pitch} and options.is_neural(voice or ""):
             words = f"the voice {voice} has a fixed pitch; leave out the pitch, or use an espeak voice"
             refusal = refusal or (Reason.BAD_OPTION, words)
         return say, pending.refusal or refusal
 
     async def _wait(self, pending: PendingRequest, request: Wait) -> None:
-        """Reply with goals, and subscribe the client to those that haven't ended."""
+        """Reply with goals, and send each goal's result, now or when it ends."""
         await self._speech.notifications.wait_done(pending)  # send earlier events of a goal before its result
         if request.ids is None:
             records = self._scheduler.unfinished()
@@ -422,7 +416,7 @@ class Requests:
 
     def _answer_overview(self, pending: PendingRequest) -> None:
         """Reply with the state of the server and with its active, pending and recent goals."""
-        recent = self._scheduler.history.latest(RECENT_GOALS, rejected=False)
+        recent = self._scheduler.history.latest(RECENT_GOALS, include_rejected=False)
         active = self._scheduler.active
         now = active.snapshot().to_json() if active else None
         goals = chain(_goal_items("pending", list(self._scheduler.pending)), _goal_items("recent", recent))
@@ -441,7 +435,7 @@ class Requests:
 
     async def _log(self, pending: PendingRequest, request: Log) -> None:
         """Reply with the most recently ended goals."""
-        records = self._scheduler.history.latest(request.count, rejected=True)
+        records = self._scheduler.history.latest(request.count, include_rejected=True)
         pending.answer(_goal_items("goal", records), count=len(records))
 
     async def _set(self, pending: PendingRequest, request: Set) -> None:
@@ -476,9 +470,9 @@ def _unknown_message(*ids: str) -> str:
 
 
 def _goal_items(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:
-    """Yield a list item for each goal.
+    """Yield an object for each goal, with the goal in the field `name`.
 
-    The goal is copied when the item is sent.
+    The goal is copied when the object is sent.
     """
     return ({name: each.snapshot().to_json()} for each in records)
 

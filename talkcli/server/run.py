@@ -20,7 +20,7 @@ from talkcli.engine.protocol import START_LIMIT_S
 from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError, UsageError, memory_limits
 from talkcli.frozen import frozen
 from talkcli.goals.goal import JsonObject, Sender
-from talkcli.goals.options import INITIAL, MAX_TEXT_CHARS, Say, Set, is_neural, shown_settings
+from talkcli.goals.options import DEFAULTS, MAX_TEXT_CHARS, Say, Set, is_neural, shown_settings
 from talkcli.goals.scheduler import Scheduler
 from talkcli.goals.voices import VoiceScheduler
 from talkcli.protocol.events import PROTOCOL, busy_greeting, greeting
@@ -48,7 +48,7 @@ class ServerSettings:
     """The options of `talk serve`."""
 
     #: default values for the options of goals
-    goals: Set = INITIAL
+    goals: Set = DEFAULTS
     #: maximum number of pending goals. Speaking 100 goals takes about three minutes, and nobody wants to wait longer.
     max_queue: int = 100
     max_text: int = MAX_TEXT_CHARS
@@ -92,7 +92,7 @@ def serve(settings: ServerSettings) -> int:
 
 
 class Server:
-    """A server that handles the connections of its clients.
+    """The server behind `talk serve`, with its goals, its engine and its clients.
 
     Create it inside a running event loop.
     """
@@ -200,9 +200,9 @@ class Server:
         return None
 
     def _maintain_socket(self) -> None:
-        """Bind the socket again if clients can't find it, or shut down if that fails.
+        """Bind the socket again if clients can't find it, and schedule the next check.
 
-        Schedule the next check.
+        If binding fails for good, shut down.
         """
         self._socket_check = self._loop.call_later(SOCKET_CHECK_S, self._maintain_socket)
         if self._listener.in_place():

@@ -23,7 +23,7 @@ from talkcli.engine.voices import is_own_driver
 from talkcli.errors import TalkError, UsageError
 from talkcli.frozen import replace
 from talkcli.goals.goal import By, Output, Sender
-from talkcli.goals.options import ENGINE_OPTIONS, INITIAL, engine_options, is_neural, require_fields, without_speaker
+from talkcli.goals.options import DEFAULTS, ENGINE_OPTIONS, engine_options, is_neural, require_fields, without_speaker
 from talkcli.goals.reasons import Reason
 from talkcli.goals.scheduler import Effect, EngineOrder, Now, Order, StateChange
 from talkcli.goals.states import State
@@ -234,7 +234,7 @@ class Speech:
             if why := self.scheduler.voices.failure(without_speaker(options["voice"])):
                 self.report(protocol.Ended(record.id, protocol.OUTCOME_FAILED, Reason.VOICE_FAILED, why))
                 return
-            options["pitch"] = INITIAL.pitch  # neural voices don't support other pitches
+            options["pitch"] = DEFAULTS.pitch  # neural voices don't support other pitches
         command = protocol.Speak(
             record.id,
             record.say.text,
@@ -258,10 +258,7 @@ class Speech:
         return following is not None, following is not None and is_neural(self.scheduler.wanted_voice(following))
 
     def _publish_change(self, record: Record, state: State, at: float) -> None:
-        """Send a goal's new state to clients.
-
-        If it has ended, log it and resume the requests waiting for it.
-        """
+        """Publish a goal's new state. If it has ended, log it and resume waiting requests."""
         self.subscribers.state_changed(record, state, at)
         if state.terminal:
             _log_goal_end(record, elapsed() - record.began_at)
@@ -428,7 +425,7 @@ class Speech:
             self.apply(self.scheduler.engine_unavailable(now))
 
     def _record_engine_failure(self, message: str) -> None:
-        """Record and log the reason why there is no engine."""
+        """Record and log why there is no engine, and resume requests that wait for voices."""
         if message != self.engine_status:
             log.write(log.sanitize(message))
         self.engine_status = message

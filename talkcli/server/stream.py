@@ -67,7 +67,7 @@ class ClientStreams:
         self._written: dict[ClientStream, None] = {}
 
     def shed_load(self) -> None:
-        """Disconnect the clients with the most unread output."""
+        """Disconnect the clients with the most unread output until the rest is below the limit."""
         while self.unread_bytes > MAX_TOTAL_OUTPUT_BYTES and self.open:
             max(self.open, key=lambda each: each.unsent_bytes + each.held_bytes).abort()
             total = MAX_TOTAL_OUTPUT_BYTES >> 20
@@ -171,11 +171,11 @@ class ClientStream:
         """Size of the output that has not been sent yet."""
         return len(self._unread)
 
-    def count_held(self, size_bytes: int) -> None:
-        """Adjust the size of the output that the receiver holds back."""
+    def count_held(self, added_bytes: int) -> None:
+        """Adjust the size of the output that the receiver holds back, and enforce the limit."""
         if self in self._streams.open:
-            self.held_bytes += size_bytes
-            self._streams.unread_bytes += size_bytes
+            self.held_bytes += added_bytes
+            self._streams.unread_bytes += added_bytes
             self._streams.shed_load()
 
     def write(self, data: bytes) -> None:
@@ -271,10 +271,7 @@ class ClientStream:
 
 
 def raise_descriptor_limit(clients: int) -> int:
-    """Raise the limit of open files to fit this number of clients.
-
-    Return the limit.
-    """
+    """Raise the limit of open files to fit this number of clients, and return the limit."""
     wanted = clients + RESERVED_DESCRIPTORS + OWN_DESCRIPTORS
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     allowed, most = (2**31 if each == resource.RLIM_INFINITY else each for each in limits)

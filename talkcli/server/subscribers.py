@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 CLIENT_ALIVE_INTERVAL_S = 5.0
 
 #: Maximum number of notifications in one iteration of the event loop. They take three milliseconds.
-_MAX_PER_TURN = 64
+_MAX_CALLS_PER_TURN = 64
 #: If one iteration adds more unread output than this, the server waits for clients to read.
 _UNREAD_LIMIT_BYTES = 1024 * 1024
 #: Maximum time to wait for clients to read.
@@ -144,7 +144,7 @@ class Subscribers:
         return listeners
 
     def _send_alive(self) -> None:
-        """Send a keep-alive message to all subscribed clients."""
+        """Send a keep-alive message to all waiting clients, and schedule the next one."""
         self._alive_timer = None
         listeners = dict.fromkeys(chain(self._watchers, self._waiting_for_room(), *self._waiters.values()))
         _publish({"event": "alive"}, listeners)
@@ -199,20 +199,20 @@ class Notifications:
             self._work(self._streams.unread_bytes)
 
     async def wait_done(self, request: PendingRequest) -> None:
-        """Wait until all functions that are now in the queue have been called."""
+        """Let a request wait until all functions now in the queue have been called."""
         if self._pending:
             self._pending.append(request.resume)
             await request.wait({})
 
     def _work(self, unread_before: int) -> None:
-        """Call functions from the queue, up to a limit for each iteration.
+        """Call some of the queued functions, and schedule a call for the rest.
 
         Args:
             unread_before: the size of the unread output before the first call.
         """
         self._turn = None
         self._working = True
-        for _ in range(min(_MAX_PER_TURN, len(self._pending))):
+        for _ in range(min(_MAX_CALLS_PER_TURN, len(self._pending))):
             self._call(self._pending.popleft())
             if self._streams.unread_bytes > unread_before + _UNREAD_LIMIT_BYTES:
                 break
@@ -227,10 +227,7 @@ class Notifications:
             self._turn = self._loop.call_soon(self._work, min(unread_before, self._streams.unread_bytes))
 
     def _await_readers(self, unread_before: int, until: float) -> None:
-        """Continue once clients have read the new output, or at the time `until`.
-
-        Otherwise, check again soon.
-        """
+        """Continue `_work` once clients have read the new output, or at the time `until`."""
         if self._streams.unread_bytes <= unread_before:
             self._work(unread_before)
         elif self._loop.time() < until:

@@ -29,11 +29,10 @@ class VoiceCatalog:
         self.driver: str | None = None
 
     def look_up(self, voice: str | None, settings_voice: str | None = None) -> tuple[str | None, Refusal | None]:
-        """Return the voice that a client asks for.
+        """Return the voice that a client asks for, and a refusal if it isn't available.
 
-        If it is not available, also return a refusal. For a neural voice, the first value is the id. For every other
-        voice, it is the client's input. The default voice is never checked, and other voices are not checked before the
-        engine has listed its voices.
+        For a neural voice, the first value is the id. For every other voice, it is the client's input. The default
+        voice is never checked, and other voices are not checked before the engine has listed its voices.
 
         Args:
             voice: the client's input.
@@ -81,7 +80,7 @@ class VoiceCatalog:
         return tuple(each for each in self.listed or () if not is_neural(each.id))
 
     def _candidates(self, voice: str) -> tuple[Voice, ...]:
-        """Return the voices to search for a name."""
+        """Return all voices that could have this name or id."""
         own = () if is_neural(voice) else self._driver_voices
         if self._foreign_driver is not None:
             return own
@@ -90,7 +89,7 @@ class VoiceCatalog:
 
     @property
     def _foreign_driver(self) -> str | None:
-        """The name of the driver, unless it is `talk`'s own.
+        """The name of the driver, or None if it is `talk`'s own.
 
         Other drivers have no neural voices.
         """

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli.goals.goal import By, Sender
-from talkcli.goals.options import INITIAL, Append, Cancel, Say
+from talkcli.goals.options import DEFAULTS, Append, Cancel, Say
 from talkcli.goals.reasons import Reason
 from talkcli.goals.scheduler import Cancellation, Effect, EngineOrder, Now, Scheduler, StateChange
 from talkcli.goals.voices import VoiceDropOrder, VoiceLoadOrder, VoiceScheduler
@@ -54,7 +54,7 @@ class Robot:
 
     def __post_init__(self) -> None:
         voices = VoiceScheduler(limit_bytes=10, file_size=lambda _: 1)
-        self.scheduler = Scheduler("4k7f", max_queue=self.max_queue, settings=INITIAL, voices=voices)
+        self.scheduler = Scheduler("4k7f", max_queue=self.max_queue, settings=DEFAULTS, voices=voices)
         self.scheduler.engine_ready(self.now)
 
     @property
@@ -140,12 +140,12 @@ class Robot:
             verb, *words = step.split()
             if len(verb) == 1:
                 given = options(words)
-                parameters = {"waited": "waited_s", "fault": "refusal", "canceled": "canceled"}
+                parameters = {"waited": "waited_s", "fault": "refusal", "canceled": "canceler"}
                 known = {name: given.pop(option) for option, name in parameters.items() if option in given}
                 if "refusal" in known:
                     known["refusal"] = Reason(known["refusal"]), "it can't be had"
-                if "canceled" in known:
-                    known["canceled"] = By(client=DOOR)
+                if "canceler" in known:
+                    known["canceler"] = By(client=DOOR)
                 self.submit(Say(**{"text": verb, **given}), verb, **known)
             elif verb == "append":
                 self.append(self._id(words[0]), **options(words[1:]))

@@ -43,8 +43,10 @@ def test_goals_are_listed_by_end_time_with_or_without_rejected_ones() -> None:
     for number, state in zip((9, 1, 4, 0, 3, 5), states, strict=True):
         history.add(ended(number, state))
     for count in (0, 2, 10):
-        assert [record.number for record in history.latest(count, rejected=True)] == [5, 3, 0, 4, 1, 9][:count][::-1]
-        assert [record.number for record in history.latest(count, rejected=False)] == [5, 0, 4, 9][:count][::-1]
+        assert [record.number for record in history.latest(count, include_rejected=True)] == [5, 3, 0, 4, 1, 9][:count][
+            ::-1
+        ]
+        assert [record.number for record in history.latest(count, include_rejected=False)] == [5, 0, 4, 9][:count][::-1]
 
 
 def test_a_forgotten_id_may_be_used_again() -> None:
@@ -53,7 +55,7 @@ def test_a_forgotten_id_may_be_used_again() -> None:
         history = History()
         for number in (1, 2, 3, 1):
             history.add(ended(number))
-        assert [record.number for record in history.latest(5, rejected=True)] == [3, 1]
+        assert [record.number for record in history.latest(5, include_rejected=True)] == [3, 1]
 
 
 def test_texts_are_limited_to_8_mib_and_the_oldest_is_dropped_first() -> None:
@@ -104,7 +106,7 @@ def test_limits_hold_after_any_goals_and_only_the_oldest_texts_are_dropped(goals
     assert [record for record in kept if record.state is State.SUCCEEDED] == [
         record for record in records if record.state is State.SUCCEEDED
     ][-7:]
-    assert history.latest(100, rejected=True) == kept
+    assert history.latest(100, include_rejected=True) == kept
     assert sum(len(record.say.text.encode()) for record in kept) <= 40
     with_text = [record.snapshot().text is not None for record in kept]
     assert with_text == sorted(with_text), "a newer text was dropped before an older one"

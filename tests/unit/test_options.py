@@ -24,8 +24,8 @@ from talkcli.engine import protocol
 from talkcli.frozen import fields, replace
 from talkcli.goals.options import (
     DEFAULT_VOICE,
+    DEFAULTS,
     ENGINE_OPTIONS,
-    INITIAL,
     INTEGER,
     MAX_KEY_CHARS,
     MAX_PRIORITY,
@@ -233,13 +233,13 @@ def test_a_missing_field_for_a_row_is_reported() -> None:
 def test_settings_are_shown_with_null_for_unset_values() -> None:
     assert list(annotated(Set)) == [option.name for option in SETTINGS]
     assert [option.name for option in SOUND_OPTIONS] == ["rate", "volume", "voice", "pitch"]
-    shown = shown_settings(INITIAL)
+    shown = shown_settings(DEFAULTS)
     assert shown == {"rate": 200, "volume": 1.0, "voice": None, "pitch": 50, "preempt": False, "ttl": None}
-    assert shown_settings(replace(INITIAL, voice=DEFAULT_VOICE, ttl=0.0)) == shown
+    assert shown_settings(replace(DEFAULTS, voice=DEFAULT_VOICE, ttl=0.0)) == shown
     assert describe_settings({**shown, "volume": 0.1 + 0.2, "ttl": 1e6})[1::4] == ["volume 0.3", "ttl 1000000 s"]
     defaults = ["rate 200", "volume 1", "default voice", "pitch 50", "new goals wait", "no ttl"]
     assert describe_settings(shown) == defaults
-    changed = shown_settings(replace(INITIAL, voice="de", ttl=2.5, preempt=True))
+    changed = shown_settings(replace(DEFAULTS, voice="de", ttl=2.5, preempt=True))
     assert describe_settings(changed)[2:] == ["voice de", "pitch 50", "new goals interrupt", "ttl 2.5 s"]
 
 
@@ -255,7 +255,7 @@ def test_a_setting_has_its_own_flags_and_help_in_serve_and_set() -> None:
 
 
 def test_the_engine_gets_the_goals_value_or_else_the_servers() -> None:
-    settings = replace(INITIAL, voice="de", rate=150)
+    settings = replace(DEFAULTS, voice="de", rate=150)
     general = {"rate": 150, "volume": 1.0, "voice": "de", "pitch": 50, "lead_in": None, "audible": None}
     general |= {"voice_only": False, "format": "text"}
     assert engine_options(Say("hi"), settings) == general

@@ -19,7 +19,7 @@ from talkcli.goals.options import (
     Say,
 )
 from talkcli.protocol.events import failure
-from talkcli.protocol.lines import decode, encode, request_line, write_request
+from talkcli.protocol.lines import decode, encode, request_line, request_to_json
 from talkcli.protocol.requests import REQUEST_TYPES, Log, Request, Status, Wait, read_request
 from tests.unit.test_lines import values
 
@@ -75,17 +75,17 @@ def refusal(message: JsonObject) -> BadRequest:
 
 @given(requests, st.none() | integers)
 def test_a_written_request_is_read_back_unchanged(request: Request, number: int | None) -> None:
-    message: JsonObject = {"seq": number, **write_request(request)}
+    message: JsonObject = {"seq": number, **request_to_json(request)}
     line = request_line(message)
     assert line == encode(message)
     assert decode(line).pop("seq") == number
-    assert read_request(decode(encode(write_request(request)))) == request
+    assert read_request(decode(encode(request_to_json(request)))) == request
 
 
 @pytest.mark.parametrize("text", ["\ud800", "Grüße \udc80", '"\\\b\n\x00\x7f\u2028🤖'])
 def test_any_text_is_written_as_one_line(text: str) -> None:
     for request in (Say(text, key=text, data={text: [text, None, 1e300, True]}), Cancel((text, text), before=text)):
-        assert request_line(write_request(request)) == encode(write_request(request))
+        assert request_line(request_to_json(request)) == encode(request_to_json(request))
 
 
 @pytest.mark.parametrize("data", [{"x": float("nan")}, {"x": [-float("inf")]}, {"x": object()}])
@@ -96,7 +96,7 @@ def test_data_that_is_not_json_is_not_written(data: JsonObject) -> None:
 
 @pytest.mark.parametrize("kind", REQUEST_TYPES)
 def test_fields_at_their_defaults_are_not_written(kind: str) -> None:
-    assert write_request(read_request(minimal(kind))) == minimal(kind)
+    assert request_to_json(read_request(minimal(kind))) == minimal(kind)
 
 
 def test_a_cancel_with_a_selector_does_not_select_all_goals() -> None:
@@ -216,5 +216,5 @@ def outcome(message: JsonObject) -> str:
         request = read_request(message)
     except BadRequest as refused:
         return refused.code
-    assert read_request(write_request(request)) == request
+    assert read_request(request_to_json(request)) == request
     return "request"

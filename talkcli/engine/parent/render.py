@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 from talkcli.engine import protocol
 from talkcli.engine.parent.process import EngineFailed, PrivateEngine
 from talkcli.errors import EXIT_ERROR, TalkError, UsageError
-from talkcli.goals.options import INITIAL, MAX_TEXT_CHARS, SOUND_OPTIONS, bad_text
+from talkcli.goals.options import DEFAULTS, MAX_TEXT_CHARS, SOUND_OPTIONS, bad_text
 from talkcli.goals.reasons import Reason
 from talkcli.goals.states import EXIT_CODES, State
 from talkcli.polling import wait_ready
@@ -100,7 +100,7 @@ def render(
     fault = bad_text(text, None)
     if fault is not None:
         raise RenderFailed(*fault)
-    sound = {each.name: getattr(INITIAL, each.name) for each in SOUND_OPTIONS} | sound
+    sound = {each.name: getattr(DEFAULTS, each.name) for each in SOUND_OPTIONS} | sound
     if markdown:
         from talkcli.engine.markdown import blank_markdown  # rarely needed, and slow to import
 

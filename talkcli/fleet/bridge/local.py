@@ -166,7 +166,7 @@ async def dial(socket: str | None, name: str, *, urgent: bool = False) -> LocalC
             except Busy as busy:
                 error: TalkError = busy
         else:
-            error = connect.unreachable(attempt, place)
+            error = connect.unreachable_error(attempt, place)
         if not (attempt.backlog_full or isinstance(error, Busy)) or loop.time() > give_up:
             raise error
         await asyncio.sleep(random.uniform(*connect.RETRY_PAUSE_S))

@@ -30,7 +30,7 @@ from talkcli.fleet.link import (
 from talkcli.fleet.payloads import Message
 from talkcli.goals.options import Say
 from talkcli.polling import wait_ready
-from talkcli.protocol.lines import request_line, write_request
+from talkcli.protocol.lines import request_line, request_to_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -202,7 +202,7 @@ class DeskLink:
                 error = self._rejection_error(code, f"send requests to {'the group ' * is_group}{to}")
                 self._calls.append(partial(on_refused, error))
 
-        line = request_line({"seq": number, **write_request(request)})
+        line = request_line({"seq": number, **request_to_json(request)})
         if len(line) > self.link.max_payload_bytes:
             limit = f"the broker accepts at most {self.link.max_payload_bytes:,}; nothing was sent"
             on_refused(RequestRefused(f"the request has {len(line):,} bytes, but {limit}", "too_long"))

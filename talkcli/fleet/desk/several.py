@@ -27,7 +27,7 @@ from talkcli.goals.goal import Goal, JsonObject
 from talkcli.goals.options import Cancel, Say, Set, check_key
 from talkcli.goals.states import State
 from talkcli.protocol.events import goals
-from talkcli.protocol.lines import FIRST_NUMBER
+from talkcli.protocol.lines import FIRST_SEQ
 from talkcli.protocol.requests import Request, Status, Wait
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class FleetRequest:
         #: the names of the robots that the request is for, and of those that haven't finished yet
         self._included, self._unfinished = set[str](), set[str]()
         self._outcomes: deque[Outcome] = deque()
-        self._numbers = itertools.count(FIRST_NUMBER)
+        self._numbers = itertools.count(FIRST_SEQ)
         #: the number of the message to the group, if the robots are a group
         self._number = next(self._numbers)
         #: the error if the broker has rejected the message to the group
