@@ -55,10 +55,10 @@ def say(number: int, **more: object) -> dict[str, object]:
     return {"seq": number, "request": "say", "text": f"sentence {number}", **more}
 
 
-async def await_clients(talk: Talk, most: int) -> None:
-    """Wait until the server has at most this number of clients. The server doesn't report that a client has left."""
+async def await_no_sessions(talk: Talk) -> None:
+    """Wait until only the watcher and this request are clients. The server doesn't report that a client has left."""
     end = time.monotonic() + 5
-    while talk.request("status")["server"]["clients"] > most:
+    while talk.request("status")["server"]["clients"] > 2:
         assert time.monotonic() < end, "a connection to the server is kept"
         await asyncio.sleep(0.01)
 
@@ -112,12 +112,11 @@ async def test_hello_keeps_the_session_of_a_remote_client(talk: Talk, pass_time:
 @in_loop
 async def test_an_idle_remote_client_loses_its_session_silently(talk: Talk, pass_time: Callable[[float], None]) -> None:
     anna = SessionsWithoutBroker(talk.socket)
-    before = talk.request("status")["server"]["clients"]
     await anna.ask({"seq": 1, "request": "status"})
     lines = anna.lines()
     pass_time(GONE + 0.1)
     anna.sessions.tick()
-    await await_clients(talk, before)
+    await await_no_sessions(talk)
     assert anna.lines() == lines
 
 
@@ -125,7 +124,6 @@ async def test_an_idle_remote_client_loses_its_session_silently(talk: Talk, pass
 async def test_only_goals_that_wait_for_room_are_dropped_by_a_goodbye(talk: Talk) -> None:
     """With and without a connection to the server. A client that returns after a goodbye gets answers again."""
     anna = SessionsWithoutBroker(talk.socket)
-    before = talk.request("status")["server"]["clients"]
     await anna.ask({"seq": 1, "request": "hello"}, "s2")
     for session in ("s1", "s2", "s3"):
         anna.post(say(2, id=f"of-{session}"), session)
@@ -135,7 +133,7 @@ async def test_only_goals_that_wait_for_room_are_dropped_by_a_goodbye(talk: Talk
     assert (await anna.ask({"seq": 4, "request": "hello"}, "s3"))["ok"]
     await anna.ask(say(5, id="last"), "s3")
     anna.post(b"", "s3")
-    await await_clients(talk, before)
+    await await_no_sessions(talk)
     with talk.connect() as wire:
         wire.request("status")
         assert sorted(item["pending"]["id"] for item in wire.items) == ["last", "of-s1", "of-s2", "of-s3"]
@@ -318,12 +316,11 @@ async def test_only_its_own_user_and_session_add_to_a_text(talk: Talk) -> None:
 @in_loop
 async def test_a_text_breaks_off_after_its_session_has_ended_but_may_be_continued_before(talk: Talk) -> None:
     anna = SessionsWithoutBroker(talk.socket)
-    before = talk.request("status")["server"]["clients"]
     for goal_id in ("kept", "left"):
         await begin(anna, goal_id, stall=1)
         anna.post(append(2, goal_id, text="Two.", at=5))
     anna.post(b"")  # a goodbye; both additions still arrive
-    await await_clients(talk, before)
+    await await_no_sessions(talk)
     await anna.ask(append(3, "kept", text=" Three.", at=9, end=True), "s2")
     talk.watcher.wait_for("left", "RECALLED")
     assert (talk.goal("left")["reason"], talk.goal("left")["text"]) == ("broken_off", "One. Two.")

@@ -132,11 +132,14 @@ class Bridge:
         self._policy = Policy(settings.name, settings.allow)
         self._systemd = ServiceManager(self._loop, self._describe_status)
         self._sessions = RemoteSessions(
-            settings.name, settings.socket, self._publish, self._max_payload, self._systemd.schedule_status
+            settings.name,
+            settings.socket,
+            self._publish,
+            self._max_payload,
+            self._systemd.schedule_status,
+            with_text=settings.with_text,
         )
-        self._publisher = Publisher(
-            self._sessions, self._publish_to_all, self._on_server_change, with_text=settings.with_text
-        )
+        self._publisher = Publisher(self._sessions, self._publish_to_all, self._on_server_change)
         offline = {"talk": PROTOCOL, "online": False, "session": self._session, "groups": groups}
         #: the message that reports that the robot is offline
         self._will = Message(self._presence_topic, encode(offline), retained=True)

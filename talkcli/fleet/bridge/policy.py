@@ -42,6 +42,8 @@ MAX_REMOTE_GOALS = 20
 MAX_REMEMBERED_IDS = 1_000
 #: Maximum size of the correlation data, which is repeated in the header of each answer.
 MAX_CORRELATION_BYTES = 256
+#: Fields of a goal that may contain its text. The message may quote it.
+PRIVATE_FIELDS = ("text", "spoken", "message")
 #: TTL of a goal whose message expired while the goal was waiting for room. Zero would mean no limit.
 _EXPIRED_TTL_S = 0.001
 
@@ -304,11 +306,10 @@ class RemoteGoals:
         self._goals |= {goal_id: (key, True) for goal_id, key in pending}
 
 
-def without_texts(message: JsonObject) -> JsonObject:
-    """Return a shorter copy of a message, without the texts of its goals."""
-    nothing = {"text": None, "spoken": None}
+def without_texts(message: JsonObject, hidden: tuple[str, ...] = ("text", "spoken")) -> JsonObject:
+    """Return a copy of a message in which the given fields of its goals are null."""
     return {
-        name: {**each, **nothing} if isinstance(each, dict) and "text" in each else each
+        name: {**each, **dict.fromkeys(hidden)} if isinstance(each, dict) and "text" in each else each
         for name, each in message.items()
     }
 

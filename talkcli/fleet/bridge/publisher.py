@@ -16,6 +16,7 @@ from talkcli.daemon import log
 from talkcli.errors import BadRequest, ServerUnavailable, TalkError
 from talkcli.fleet import topics
 from talkcli.fleet.bridge.local import dial
+from talkcli.fleet.bridge.policy import PRIVATE_FIELDS
 from talkcli.fleet.payloads import LastGoal, Message, RobotStatus
 from talkcli.frozen import replace
 from talkcli.goals.options import MAX_LOG_GOALS
@@ -58,21 +59,17 @@ _FIRST_SERVER_RETRY_S, _LAST_SERVER_RETRY_S = 0.2, 5.0
 class Publisher:
     """Watches the robot's server, and publishes its status and events."""
 
-    def __init__(
-        self, sessions: RemoteSessions, publish: PublishToAll, on_server_change: Callable[[], None], *, with_text: bool
-    ) -> None:
+    def __init__(self, sessions: RemoteSessions, publish: PublishToAll, on_server_change: Callable[[], None]) -> None:
         """Create a publisher that isn't connected to the server yet.
 
         Args:
             sessions: the remote sessions, which receive all changes of goals.
             publish: publishes a message to all subscribers.
             on_server_change: called after connecting to the server and after disconnecting from it.
-            with_text: whether to publish the texts of goals.
         """
         self._sessions = sessions
         self._publish = publish
         self._on_server_change = on_server_change
-        self._with_text = with_text
         #: boot id, pid, version and features of the server; None if the bridge isn't connected to it
         self.server: JsonObject | None = None
         self._connection: LocalConnection | None = None
@@ -188,9 +185,8 @@ class Publisher:
         if isinstance(event, StateChanged):
             self._update_goals(event)
             self._sessions.handle_goal_change(event, server.boot)
-            if event.goal and (not self._with_text or len(line) >= self._sessions.max_payload()):
-                # The goal's message may quote its text.
-                goal = replace(event.goal, text=None, spoken=None, message=None)
+            if event.goal and (not self._sessions.with_text or len(line) >= self._sessions.max_payload()):
+                goal = replace(event.goal, **dict.fromkeys(PRIVATE_FIELDS))
                 line = encode(replace(event, goal=goal).to_json()).removesuffix(b"\n")
         elif isinstance(event, PausedChanged):
             self._paused = event.paused
@@ -221,7 +217,7 @@ class Publisher:
         known = self._texts.get(event.id)
         if known and len(known) < _MAX_STATUS_TEXT_CHARS:
             self._texts[event.id] = (known + event.text)[:_MAX_STATUS_TEXT_CHARS]
-            if event.id == self._active and self._with_text:
+            if event.id == self._active and self._sessions.with_text:
                 self.schedule_status()
 
     # -- to the broker
@@ -237,7 +233,7 @@ class Publisher:
         ended = LastGoal(last.id, last.state, last.reason, _shown_text(last), last.ended_at) if last else None
         status = RobotStatus(active, text, len(self._texts.keys() - {active}), self._paused, ended).to_json()
         payload = encode(status)
-        if not self._with_text or len(payload) > self._sessions.max_payload():
+        if not self._sessions.with_text or len(payload) > self._sessions.max_payload():
             for each in (status, status["last"]):
                 if isinstance(each, dict):
                     del each["text"]

@@ -66,6 +66,8 @@ class RemoteSessions:
         publish: Callable[[Message, int], None],
         max_payload: Callable[[], int],
         on_change: Callable[[], None],
+        *,
+        with_text: bool = True,
     ) -> None:
         """Create an empty collection of sessions.
 
@@ -75,8 +77,9 @@ class RemoteSessions:
             publish: publishes lines for a client, with a QoS of 0 or 1.
             max_payload: returns the size of the largest payload that the broker accepts, in bytes.
             on_change: called when the number of pending goals may have changed.
+            with_text: whether the status, the events and the answers to `watch` contain the texts of goals.
         """
-        self.name, self.socket = name, socket
+        self.name, self.socket, self.with_text = name, socket, with_text
         self.publish, self.max_payload = publish, max_payload
         self.ids, self.goals = policy.SentIds(), policy.RemoteGoals()
         #: limits the number of connections that are waiting for the server's greeting
@@ -466,9 +469,13 @@ class RemoteSession:
             if "seq" in message:
                 answers += self._process_answer(message)
             elif "event" in message:
-                if message["event"] == "result" and isinstance(goal := message.get("goal"), dict):
+                is_result = message["event"] == "result"
+                if is_result and isinstance(goal := message.get("goal"), dict):
                     self._awaited.discard(str(goal.get("id")))
-                answers.append((line + b"\n", None))
+                if is_result or self._sessions.with_text or message.get("id") in self._awaited:
+                    answers.append((line + b"\n", None))
+                elif message["event"] not in {"text", "word"}:
+                    answers.append((encode(policy.without_texts(message, policy.PRIVATE_FIELDS)), None))
         self._publish(answers)
         self._end_if_done()
 
@@ -489,6 +496,8 @@ class RemoteSession:
             waits = isinstance(request, Wait) or (isinstance(request, Say) and (request.wait or request.feedback))
             if waits and state is not None and not state.terminal:
                 self._awaited.add(str(goal.get("id")))
+        if isinstance(request, Watch) and not self._sessions.with_text:
+            message = policy.without_texts(message, policy.PRIVATE_FIELDS)
         found: list[JsonObject] = []
         if "ok" in message:
             self._server.forget(exchange)
