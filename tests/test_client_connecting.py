@@ -102,7 +102,7 @@ def test_a_client_reaches_a_server_that_starts_while_it_tries(
     prepare(path)
     with contextlib.ExitStack() as stack:
         waits = Waits(monkeypatch, lambda n: stack.enter_context(serving(path, *greetings)) if n == 3 else None)
-        attempt = connect.connect(path, HELLO, keep_trying=60)
+        attempt = connect.connect(path, HELLO, keep_trying_s=60)
         assert attempt.socket
         attempt.socket.close()
     assert len(waits.pauses) == 3 + len(greetings) - 1
@@ -123,7 +123,7 @@ def test_a_refused_client_does_not_try_again(
 ) -> None:
     waits = Waits(monkeypatch)
     with serving(path, greeting), pytest.raises(error):
-        connect.connect(path, HELLO, keep_trying=60)
+        connect.connect(path, HELLO, keep_trying_s=60)
     assert waits.pauses == []
 
 
@@ -131,11 +131,11 @@ def test_an_unusable_socket_path_is_tried_once(path: str, monkeypatch: pytest.Mo
     waits = Waits(monkeypatch)
     os.makedirs(path)
     with pytest.raises(ServerUnavailable, match="a directory, not a socket"):
-        connect.connect(path, HELLO, keep_trying=60)
+        connect.connect(path, HELLO, keep_trying_s=60)
     monkeypatch.setattr("talkcli.paths.client_sockets", lambda _: [f"{path}/s"])
     monkeypatch.setattr("talkcli.peers.credentials", lambda _: (1, os.getuid() + 1))
     with serving(f"{path}/s"), pytest.raises(AccessDenied, match="belongs to uid"):
-        connect.connect(None, HELLO, keep_trying=60)
+        connect.connect(None, HELLO, keep_trying_s=60)
     assert waits.pauses == []
 
 
@@ -146,22 +146,22 @@ def test_a_refusal_at_one_socket_does_not_end_the_wait_for_another(path: str, mo
     with contextlib.ExitStack() as stack:
         stack.enter_context(serving(denied, refusal))
         Waits(monkeypatch, lambda _: stack.enter_context(serving(path, GREETING)))
-        attempt = connect.connect(None, HELLO, keep_trying=60)
+        attempt = connect.connect(None, HELLO, keep_trying_s=60)
         assert attempt.socket
         attempt.socket.close()
     assert attempt.path == path
 
 
 @pytest.mark.parametrize(
-    ("keep_trying", "left", "least", "most"), [(0, None, 4, 5), (1, None, 4, 5), (60, None, 50, 60), (2, 2, 1, 2)]
+    ("keep_trying_s", "left", "least", "most"), [(0, None, 4, 5), (1, None, 4, 5), (60, None, 50, 60), (2, 2, 1, 2)]
 )
 def test_the_greeting_and_replies_may_take_the_remaining_time(
-    path: str, monkeypatch: pytest.MonkeyPatch, keep_trying: float, left: float | None, least: float, most: float
+    path: str, monkeypatch: pytest.MonkeyPatch, keep_trying_s: float, left: float | None, least: float, most: float
 ) -> None:
     waits = Waits(monkeypatch)
     with serving(path, GREETING):
         end = None if left is None else time.monotonic() + left
-        connection = SocketConnection(path, keep_trying=keep_trying, end=end)
+        connection = SocketConnection(path, keep_trying_s=keep_trying_s, end=end)
         connection.close()
     assert all(least <= seconds <= most for seconds in waits.others)
     assert max(least, 4) <= connection._patience <= max(most, 5)

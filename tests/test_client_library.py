@@ -202,7 +202,7 @@ def test_a_full_server_answers_urgent_clients_and_refuses_others(make_talk: Make
         with Client.over(SocketConnection(talk.socket, urgent=True)) as urgent:
             assert [goal.id for goal in urgent.status().recent] == [goal_id]
         with pytest.raises(Busy, match="--max-clients"):
-            SocketConnection(talk.socket, patience=0.5)
+            SocketConnection(talk.socket, patience_s=0.5)
         assert 0.5 <= time.monotonic() - started_at < 2.5
         late = talk.start("say", "--wait", "length=0")
     assert talk.finish(late).code == 0  # it was admitted when a place became free

@@ -40,7 +40,7 @@ def test_a_patient_say_waits_while_the_server_is_alive() -> None:
         peer.reply("status", **OVERVIEW)
         peer.send(result())
 
-    with serving(play) as path, Client.over(SocketConnection(path, patience=0.2)) as client:
+    with serving(play) as path, Client.over(SocketConnection(path, patience_s=0.2)) as client:
         handle = client.say("a", patient=True)
         assert (handle.state, handle.speech_paused, handle.attached) == (State.PENDING, True, False)
         client.status()
@@ -54,7 +54,7 @@ def test_a_reply_to_pause_may_take_longer_than_the_timeout() -> None:
         peer.send({"seq": seq, "ok": True, "paused": True, "goal": goal("ACTIVE")})
         peer.reply("resume", paused=False, goal=None)
 
-    with serving(play) as path, Client.over(SocketConnection(path, patience=0.2)) as client:
+    with serving(play) as path, Client.over(SocketConnection(path, patience_s=0.2)) as client:
         paused = client.pause()
         assert paused
         assert paused.state is State.ACTIVE
@@ -63,7 +63,7 @@ def test_a_reply_to_pause_may_take_longer_than_the_timeout() -> None:
 
 def test_a_silent_server_is_considered_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("talkcli.client.core.SILENCE_LIMIT_S", 0.3)
-    with serving(ignore_say) as path, Client.over(SocketConnection(path, patience=5)) as client:
+    with serving(ignore_say) as path, Client.over(SocketConnection(path, patience_s=5)) as client:
         started_at = time.monotonic()
         with pytest.raises(Lost, match=r"nothing for 0\.3 s"):
             client.say("a", patient=True)

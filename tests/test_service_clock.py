@@ -38,7 +38,7 @@ class _BusyEngine:
 def suspends(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The length of each suspend in seconds. The server's clock is ahead by their sum."""
     seconds: list[float] = []
-    monkeypatch.setattr(speech, "elapsed", lambda: time.monotonic() + sum(seconds))
+    monkeypatch.setattr(speech, "monotonic_now", lambda: time.monotonic() + sum(seconds))
     return seconds
 
 
@@ -74,4 +74,4 @@ async def test_requests_after_a_suspend_find_no_expired_goals(suspends: list[flo
 @pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="this system has no clock that includes suspends")
 def test_the_servers_clock_includes_suspends() -> None:
     before = time.clock_gettime(time.CLOCK_BOOTTIME)
-    assert before <= speech.elapsed() <= time.clock_gettime(time.CLOCK_BOOTTIME)
+    assert before <= speech.monotonic_now() <= time.clock_gettime(time.CLOCK_BOOTTIME)

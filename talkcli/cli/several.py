@@ -123,9 +123,9 @@ def _send_request(
         from talkcli.fleet.desk.several import FleetRequest
 
         selection = Selection(paths.named_robot(options.robot, options.socket) or "")
-        patience = min(ANSWER_LIMIT_S, timeout or ANSWER_LIMIT_S)
+        patience_s = min(ANSWER_LIMIT_S, timeout or ANSWER_LIMIT_S)
         with FleetRequest(
-            broker, selection, request, name=name, interrupt=interrupts.watched, patience=patience
+            broker, selection, request, name=name, interrupt=interrupts.watched, patience_s=patience_s
         ) as fleet_request:
             try:
                 printer.show_outcomes(fleet_request, seconds_left(options.deadline(timeout)))

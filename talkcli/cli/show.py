@@ -87,13 +87,13 @@ class CommonOptions:
         from talkcli.client.connect import ANSWER_LIMIT_S
 
         began, end = time.monotonic(), self.deadline(timeout)
-        options = {"patience": min(ANSWER_LIMIT_S, timeout or ANSWER_LIMIT_S), "end": end, **options}
+        options = {"patience_s": min(ANSWER_LIMIT_S, timeout or ANSWER_LIMIT_S), "end": end, **options}
         connect_timeout, self.connect_timeout = self.connect_timeout, None
         seconds = connect_timeout or 0.0
         if end is not None:
             seconds = min(seconds, max(0.0, end - began))
         try:
-            return Client.over(self._open_connection(keep_trying=seconds, **options))
+            return Client.over(self._open_connection(keep_trying_s=seconds, **options))
         except ServerUnavailable as error:
             now = time.monotonic()
             if connect_timeout is None or now < began + seconds:  # retrying wasn't requested or can't help

@@ -547,7 +547,7 @@ def _own_goal_ids(client: Client) -> list[str]:
 
     The list is empty if the server is on another machine.
     """
-    if client._connection.listener is None:
+    if client._connection.listener_pid is None:
         return []  # process ids can't be compared with those of another machine
     goals = unfinished(client.status())
     return [each.id for each in goals if each.client is not None and each.client.pid == os.getpid()]

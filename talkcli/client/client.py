@@ -75,7 +75,7 @@ class Client:
         """
         if not timeout > 0:
             raise UsageError(f"the timeout must be more than 0, got {timeout!r}")
-        self._connection: Connection = ReconnectingConnection(socket, name=name, patience=timeout)
+        self._connection: Connection = ReconnectingConnection(socket, name=name, patience_s=timeout)
         #: the first server's boot id, which is prepended to ids that are only numbers
         self._first_boot = self._connection.boot
 
@@ -186,7 +186,7 @@ class Client:
         if block:
             self._connection.request(request, accepted)
         else:
-            handle._expect(request, time.monotonic())
+            handle._set_request(request, time.monotonic())
             self._connection.submit(request, accepted, handle._fail)
         return handle
 

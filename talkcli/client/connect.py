@@ -73,7 +73,7 @@ class ConnectionAttempt:
 def reach(
     named_path: str | None, failures: tuple[tuple[str, Exception], ...] = (), only_path: str | None = None
 ) -> ConnectionAttempt:
-    """Try to connect to the first usable socket, without sending anything.
+    """Connect to the first usable socket, and return the attempt. Nothing is sent yet.
 
     Args:
         named_path: path of the only socket to try, as the user named it; None for the usual places.
@@ -108,7 +108,7 @@ def _check_owner(connected: _socket.socket) -> None:
 def send_early(
     attempt: ConnectionAttempt, hello: JsonObject, request: JsonObject, before_request: Callable[[], None]
 ) -> ConnectionAttempt | None:
-    """Send hello, and the first request if the server's greeting arrives soon.
+    """Send hello, and the first request if the greeting arrives soon. Return the attempt.
 
     The request is not sent if the greeting is late or unexpected, or if the server may lack a feature.
 
@@ -195,38 +195,39 @@ def hello(name: str | None, *, urgent: bool) -> JsonObject:
 def connect(
     named_path: str | None,
     hello: JsonObject,
-    patience: float = ANSWER_LIMIT_S,
+    patience_s: float = ANSWER_LIMIT_S,
     interrupt: Mapping[int, int] | None = None,
     attempt: ConnectionAttempt | None = None,
-    keep_trying: float = 0.0,
-    end: float | None = None,
+    keep_trying_s: float = 0.0,
+    greeting_deadline: float | None = None,
 ) -> ConnectionAttempt:
     """Connect to the first usable server, and read its greeting. Retry for a limited time.
 
     Args:
         named_path: path of the only socket to try; None for the usual places.
         hello: the hello message.
-        patience: seconds in which the server must send its greeting. If it has too many clients or a full backlog, this
-            is also how long to try again.
+        patience_s: seconds in which the server must send its greeting. If it has too many clients or a full backlog,
+            this is also how long to try again.
         interrupt: descriptors that interrupt the wait, with their poll events, as in `polling.wait_ready`.
         attempt: a connection that has already been opened.
-        keep_trying: seconds for which to try again if there is no server yet. If this time is longer than `patience`,
-            the server may use the rest of it for its greeting.
-        end: with `keep_trying`, the monotonic time by which the server must have sent its greeting. None for no limit.
+        keep_trying_s: seconds for which to try again if there is no server yet. If this time is longer than
+            `patience_s`, the server may use the rest of it for its greeting.
+        greeting_deadline: with `keep_trying_s`, the monotonic time by which the server must have sent its greeting.
+            None for no limit.
 
     Raises:
         ServerUnavailable, AccessDenied, ProtocolMismatch, Busy: there is no server that can be used.
         Interrupted: one of the interrupting descriptors is ready.
     """
-    give_up = time.monotonic() + (keep_trying or patience)
+    give_up = time.monotonic() + (keep_trying_s or patience_s)
     attempt = attempt or reach(named_path)
     while True:
         error: TalkError | None = None
-        again = attempt.backlog_full or (keep_trying > 0 and _server_may_start(attempt))
+        again = attempt.backlog_full or (keep_trying_s > 0 and _server_may_start(attempt))
         if attempt.socket:
-            greet_by = max(time.monotonic() + patience, give_up)
-            if keep_trying and end is not None:
-                greet_by = min(greet_by, end)
+            greet_by = max(time.monotonic() + patience_s, give_up)
+            if keep_trying_s and greeting_deadline is not None:
+                greet_by = min(greet_by, greeting_deadline)
             try:
                 return _greet(attempt, hello, greet_by, interrupt)
             except AccessDenied as denied:
@@ -238,7 +239,7 @@ def connect(
                 error, again = refused, True
             except ConnectionError:
                 error = ServerUnavailable(f"the server at {attempt.path} closed the connection before it answered")
-                again = keep_trying > 0
+                again = keep_trying_s > 0
         left = give_up - time.monotonic()
         if not again or attempt.request_sent or left <= 0:
             raise error or unreachable_error(attempt, named_path)
@@ -255,11 +256,11 @@ def _server_may_start(attempt: ConnectionAttempt) -> bool:
 
 
 def _greet(
-    attempt: ConnectionAttempt, hello: JsonObject, end: float, interrupt: Mapping[int, int] | None
+    attempt: ConnectionAttempt, hello: JsonObject, deadline: float, interrupt: Mapping[int, int] | None
 ) -> ConnectionAttempt:
     """Send hello if necessary, and add the server's greeting to the attempt.
 
-    The connection is closed if the greeting has not arrived by `end` (monotonic), and after any other error.
+    The connection is closed if the greeting has not arrived by `deadline` (monotonic), and after any other error.
 
     Raises:
         ConnectionError: the server closed the connection before it sent a greeting.
@@ -280,7 +281,7 @@ def _greet(
             except (BrokenPipeError, ConnectionResetError):
                 pass  # the server has closed the connection, but its error message can still be read
         while b"\n" not in received:
-            if not wait_ready({connected.fileno(): POLLIN}, end - time.monotonic(), interrupt):
+            if not wait_ready({connected.fileno(): POLLIN}, deadline - time.monotonic(), interrupt):
                 listener, _ = peers.credentials(connected)
                 hint = f"check process {listener}, and restart it if it hangs"
                 raise ServerUnavailable(f"the server at {attempt.path} doesn't respond; {hint}")

@@ -51,17 +51,17 @@ def checked_sender_name(name: str | None) -> str | None:
     return name
 
 
-def take_repeatedly(connection: Connection, take: Callable[[], _T], end: float | None) -> Iterator[_T]:
+def take_repeatedly(connection: Connection, take: Callable[[], _T], deadline: float | None) -> Iterator[_T]:
     """Yield the results of `take`, and wait for the server while there are none.
 
-    An empty result is yielded if `end` has passed or the connection has ended. Nothing more is received after `end`,
-    so that a loop over the results ends even if the server keeps sending events.
+    An empty result is yielded if `deadline` has passed or the connection has ended. Nothing more is received after
+    `deadline`, so that a loop over the results ends even if the server keeps sending events.
 
     Args:
         connection: the connection to wait for.
         take: removes and returns received events, or returns a false value if there are none. It is called while
             `connection.changed` is held.
-        end: monotonic time; None for no limit.
+        deadline: monotonic time; None for no limit.
     """
     found: _T
 
@@ -76,8 +76,8 @@ def take_repeatedly(connection: Connection, take: Callable[[], _T], end: float |
             with connection.changed:
                 arrived()
         else:
-            connection.wait_until(arrived, end)
-            late = end is not None and time.monotonic() >= end
+            connection.wait_until(arrived, deadline)
+            late = deadline is not None and time.monotonic() >= deadline
         yield found
 
 
@@ -96,16 +96,16 @@ class Connection(ClientCore):
     """
 
     #: id of the process that listens at the socket, or None if the server is on another machine
-    listener: int | None = None
+    listener_pid: int | None = None
     #: the class that `begin` uses for exchanges
     exchange_type = Exchange
 
-    def __init__(self, patience: float) -> None:
+    def __init__(self, patience_s: float) -> None:
         """Initialize a connection.
 
-        The server must answer each request within `patience` seconds.
+        The server must answer each request within `patience_s` seconds.
         """
-        super().__init__(patience, time.monotonic())
+        super().__init__(patience_s, time.monotonic())
         #: protects all state, and is notified after messages have been processed
         self.changed = threading.Condition()
         self._process = os.getpid()
@@ -149,7 +149,7 @@ class Connection(ClientCore):
         exchange = self.begin(request, on_reply)
         # A normal `say` can't be interrupted, because the caller needs the goal's id to cancel the goal. A patient
         # `say` can be interrupted, because closing the connection cancels a goal that is waiting for room in the queue.
-        interruptible = exchange.slow or not isinstance(request, Say)
+        interruptible = exchange.unlimited or not isinstance(request, Say)
         try:
             self.wait_until(lambda: exchange.over, None, interruptible=interruptible)
         finally:
@@ -311,9 +311,9 @@ class SocketConnection(Connection):
         name: str | None = None,
         urgent: bool = False,
         interrupt: Mapping[int, int] | None = None,
-        patience: float = ANSWER_LIMIT_S,
+        patience_s: float = ANSWER_LIMIT_S,
         attempt: ConnectionAttempt | None = None,
-        keep_trying: float = 0.0,
+        keep_trying_s: float = 0.0,
         end: float | None = None,
     ) -> None:
         """Connect to a server.
@@ -326,20 +326,20 @@ class SocketConnection(Connection):
             urgent: whether the client sends only `status` and `cancel`. A full server keeps some places for such
                 clients.
             interrupt: descriptors that interrupt any wait, with their poll events, as in `polling.wait_ready`.
-            patience: seconds in which the server must send its greeting, and must answer each request.
+            patience_s: seconds in which the server must send its greeting, and must answer each request.
             attempt: an open connection, on which the first request may have been sent.
-            keep_trying: seconds for which to try again if there is no server yet. After connecting, the rest of this
-                time is the limit for each answer, unless `patience` is longer.
-            end: with `keep_trying`, the monotonic time by which the server must have sent its greeting. None for no
+            keep_trying_s: seconds for which to try again if there is no server yet. After connecting, the rest of this
+                time is the limit for each answer, unless `patience_s` is longer.
+            end: with `keep_trying_s`, the monotonic time by which the server must have sent its greeting. None for no
                 limit.
         """
-        super().__init__(patience)
+        super().__init__(patience_s)
         self._interrupt = interrupt
         self._hello_message = hello(checked_sender_name(name), urgent=urgent)
         self._named = paths.named_socket(socket)
-        give_up = time.monotonic() + keep_trying
-        attempt = connect(self._named, self._hello_message, patience, self._interrupt, attempt, keep_trying, end)
-        self._patience = max(patience, round(give_up - time.monotonic(), 1))
+        give_up = time.monotonic() + keep_trying_s
+        attempt = connect(self._named, self._hello_message, patience_s, self._interrupt, attempt, keep_trying_s, end)
+        self._patience = max(patience_s, round(give_up - time.monotonic(), 1))
         #: the socket, or None while disconnected
         self._socket: _socket.socket | None = attempt.socket
         assert attempt.server
@@ -349,7 +349,7 @@ class SocketConnection(Connection):
         self._received_early = attempt.received
 
     @property
-    def listener(self) -> int | None:  # type: ignore[override]
+    def listener_pid(self) -> int | None:  # type: ignore[override]
         """The id of the process that listens at the socket, or None while disconnected."""
         return None if self._socket is None else peers.credentials(self._socket)[0]
 
@@ -431,9 +431,11 @@ class ReconnectingConnection(SocketConnection):
     It has no thread of its own, so it reconnects during later calls. Only `close` ends it for good.
     """
 
-    def __init__(self, socket: str | None = None, *, name: str | None = None, patience: float = ANSWER_LIMIT_S) -> None:
+    def __init__(
+        self, socket: str | None = None, *, name: str | None = None, patience_s: float = ANSWER_LIMIT_S
+    ) -> None:
         """Connect to a server. The arguments are those of `SocketConnection`."""
-        super().__init__(socket, name=name, patience=patience)
+        super().__init__(socket, name=name, patience_s=patience_s)
         #: monotonic time of the next attempt to connect. During an attempt, this is the time limit for the greeting.
         self._due = 0.0
 

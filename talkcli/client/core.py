@@ -193,7 +193,7 @@ class TrackedGoal:
         self._with_feedback = False
         self._buffer = EventBuffer()
 
-    def _expect(self, request: Say, now: float) -> None:
+    def _set_request(self, request: Say, now: float) -> None:
         """Set the goal's id and text from a `say` request, before the server answers."""
         self.goal = replace(self.goal, id=request.id or "", text=request.text)
         if request.wait:
@@ -344,7 +344,7 @@ class Exchange:
         self.heard_at = 0.0
 
     @property
-    def slow(self) -> bool:
+    def unlimited(self) -> bool:
         """Whether there is no time limit for the answer."""
         request = self.request
         if isinstance(request, Append):
@@ -363,11 +363,11 @@ class ClientCore:
     #: the kinds of requests that may have an effect even if no answer is received
     lasting: tuple[type[Request], ...] = (Say,)
 
-    def __init__(self, patience: float, now: float) -> None:
+    def __init__(self, patience_s: float, now: float) -> None:
         """Initialize the state for a connection that is already open.
 
         Args:
-            patience: seconds in which the server must answer.
+            patience_s: seconds in which the server must answer.
             now: the monotonic time.
         """
         #: the server's socket or address, for error messages
@@ -386,7 +386,7 @@ class ClientCore:
         self.absence = ""
         #: the error of the last attempt to reconnect, or None if it succeeded
         self.connect_error: TalkError | None = None
-        self._patience = patience
+        self._patience = patience_s
         self._numbers: Iterator[int] = itertools.count(FIRST_SEQ)
         self._splitter = LineSplitter()
         #: monotonic time at which bytes were last received
@@ -554,7 +554,7 @@ class ClientCore:
         The request must be sent, or the next line of its answer must arrive, by this time.
         """
         if exchange.sent:
-            return float("inf") if exchange.slow else exchange.heard_at + self._patience
+            return float("inf") if exchange.unlimited else exchange.heard_at + self._patience
         ttl = exchange.request.ttl if isinstance(exchange.request, Say) else None
         return exchange.heard_at + min(self._patience, ttl or self._patience)
 

@@ -46,7 +46,7 @@ class TextSender:
         return self._open
 
     def accepted(self, goal_id: str) -> str:
-        """Record that the server has accepted the open request, and return its text."""
+        """Record that the server has accepted the unanswered request, and return its text."""
         request = self._open
         assert request
         self.refused()
@@ -56,7 +56,7 @@ class TextSender:
         return request.text
 
     def refused(self) -> None:
-        """Forget the open request and its text."""
+        """Forget the unanswered request and its text, which is not sent again."""
         if self._open:
             self._unsent, self._open = self._unsent[len(self._open.text) :], None
 

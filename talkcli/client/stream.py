@@ -129,7 +129,7 @@ class SpeechStream:
         return handle
 
     def _add_text(self, *_: object) -> None:
-        """Record that the server has accepted the open request to add text."""
+        """Add text to the goal that the server has accepted."""
         assert self.goal
         self.goal._grow(self._text.accepted(self.goal.id))
 

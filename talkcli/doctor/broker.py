@@ -231,7 +231,7 @@ class BrokerExamination:
         end = time.monotonic() + _STEP_LIMIT_S
         try:
             connection = connect_robot(
-                self._robot, broker, name="talk doctor", interrupt=self._interrupt, patience=LOGIN_LIMIT_S, end=end
+                self._robot, broker, name="talk doctor", interrupt=self._interrupt, patience_s=LOGIN_LIMIT_S, end=end
             )
             with Client.over(connection) as client:
                 began = time.monotonic()

@@ -151,7 +151,7 @@ def local_pid(client: Client) -> int | None:
     The server's socket may be forwarded by ssh, for example. If systemd created the socket, the kernel reports systemd
     as the listening process.
     """
-    pid = client._connection.listener
+    pid = client._connection.listener_pid
     is_local = pid is not None and (pid == client.server_pid or peers.command_name(pid) == "systemd")
     return client.server_pid if is_local else None
 

@@ -230,9 +230,7 @@ class Scheduler:
         self._by_id[record.id] = record
         effects: list[Effect] = [StateChange(record, State.PENDING)]
         if by:
-            words = (
-                "the goal was cancelled before it started" if canceler else "the goal was cancelled before it arrived"
-            )
+            words = f"the goal was cancelled before it {'started' if canceler else 'arrived'}"
             return record, effects + self._end_unqueued(record, Reason.CANCELED, words, by, now)
         if expired:
             words = _expiry_message(record)
@@ -310,7 +308,7 @@ class Scheduler:
         return [EngineOrder(record, Order.APPEND)] if record.state is State.ACTIVE and (added or addition.end) else []
 
     def producer_left(self, record: Record, now: Now) -> list[Effect]:
-        """Break off a text whose sender has left, or wait for a new connection first.
+        """Handle the loss of a text's sender: end the goal, or wait for a new connection.
 
         Wait only if the sender chose the goal's id. Return the effects.
         """

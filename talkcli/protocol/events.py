@@ -296,7 +296,7 @@ def check_greeting(message: JsonObject) -> None:
 
 
 def item(seq: int | None, **fields: object) -> JsonObject:
-    """Return the message for one item of a list.
+    """Return the message for a list item in the answer to the request number `seq`.
 
     The items are sent before the reply.
     """

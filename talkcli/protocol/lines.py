@@ -102,10 +102,7 @@ def request_line(message: JsonObject) -> bytes:
 
 
 def _encode_simple(value: object) -> str:
-    """Encode a simple value as JSON.
-
-    Raises TypeError if the value needs the `json` module.
-    """
+    """Encode a simple value as JSON, or raise TypeError if it needs the `json` module."""
     if isinstance(value, str):
         if value.isprintable() and '"' not in value and "\\" not in value:
             return f'"{value}"'
@@ -124,9 +121,7 @@ def _encode_simple(value: object) -> str:
 
 
 def encode(message: JsonObject) -> bytes:
-    """Encode an object as a line of JSON.
-
-    Raises ValueError or TypeError if that is impossible.
+    """Encode an object as a line of JSON, or raise ValueError or TypeError.
 
     Text is written as UTF-8. Only lone surrogates, which UTF-8 can't hold, are escaped.
     """
@@ -138,10 +133,7 @@ def encode(message: JsonObject) -> bytes:
 
 
 def decode(line: bytes) -> JsonObject:
-    """Decode the JSON object in a line.
-
-    Raises BadRequest if the line is malformed or too long.
-    """
+    """Decode the JSON object in a line, or raise BadRequest if it is malformed or too long."""
     from talkcli.errors import BadRequest, LineTooLong
 
     if isinstance(line, TruncatedLine):
@@ -184,10 +176,7 @@ def _json_function(name: str) -> Callable[[Any], Any]:
 
 
 def _create_object(pairs: list[tuple[str, object]]) -> JsonObject:
-    """Return an object with the given keys and values.
-
-    Raises ValueError if a key appears twice.
-    """
+    """Return an object with these keys and values, or raise ValueError for a repeated key."""
     fields = dict(pairs)
     if len(fields) != len(pairs):
         raise ValueError("a key appears twice")
@@ -200,17 +189,14 @@ def _refuse_constant(name: str) -> object:
 
 
 def _parse_integer(digits: str) -> int:
-    """Convert a string of digits to an integer.
-
-    Raises ValueError if the string is too long.
-    """
+    """Convert digits to an integer, or raise ValueError if there are too many."""
     if len(digits) > MAX_DIGITS:
         raise ValueError(f"an integer has {len(digits):,} digits (at most {MAX_DIGITS})")
     return int(digits)
 
 
 def _parse_float(digits: str) -> float:
-    """Convert a string to a float. Raises ValueError if the number is too large."""
+    """Convert digits to a float, or raise ValueError if the number is too large."""
     number = float(digits)
     if not _is_finite(number):
         raise ValueError("a number is too large")

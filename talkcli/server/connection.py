@@ -218,8 +218,8 @@ class ClientConnection(asyncio.Protocol):
         self._held_feedback = b""
         self._half_closed = self._finishing = self._work_is_scheduled = False
         self._bad_lines = 0
-        self._first_limit = self._close_after(FIRST_REQUEST_S, f"no request arrived within {FIRST_REQUEST_S:g} s")
-        self._line_limit: asyncio.TimerHandle | None = None
+        self._first_timer = self._close_after(FIRST_REQUEST_S, f"no request arrived within {FIRST_REQUEST_S:g} s")
+        self._line_timer: asyncio.TimerHandle | None = None
 
     def begin(self) -> None:
         """Register the client with the handler, and start reading its requests."""
@@ -240,8 +240,8 @@ class ClientConnection(asyncio.Protocol):
 
     def connection_lost(self, error: Exception | None) -> None:
         """Process the last requests of a disconnected client, and remove it from the server."""
-        self._first_limit.cancel()
-        self._cancel_line_limit()
+        self._first_timer.cancel()
+        self._cancel_line_timer()
         if error is not None and self.admitted:
             self._process_last_requests()
         self._lines.clear()
@@ -254,7 +254,7 @@ class ClientConnection(asyncio.Protocol):
         if self._splitter.size >= MAX_LINE_BYTES:
             self._lines.append(self._splitter.take_rest())  # this line is too long
         if b"\n" in data:
-            self._cancel_line_limit()  # the next line has a new time limit
+            self._cancel_line_timer()  # the next line has a new time limit
         self._work()
 
     def eof_received(self) -> None:
@@ -325,7 +325,7 @@ class ClientConnection(asyncio.Protocol):
     # -- internals
 
     def _close_after(self, seconds: float, message: str) -> asyncio.TimerHandle:
-        """Start a timer that closes the connection with an error message."""
+        """Start and return a timer that closes the connection with an error message."""
         return self._loop.call_later(seconds, self.close_with, failure(None, "too_slow", message))
 
     def _update_reading(self) -> None:
@@ -341,15 +341,15 @@ class ClientConnection(asyncio.Protocol):
         else:
             self.stream.pause_reading()
         if not reading or not self._splitter.size:
-            self._cancel_line_limit()
-        elif self._line_limit is None:
-            self._line_limit = self._close_after(LINE_LIMIT_S, f"a line was not complete within {LINE_LIMIT_S:g} s")
+            self._cancel_line_timer()
+        elif self._line_timer is None:
+            self._line_timer = self._close_after(LINE_LIMIT_S, f"a line was not complete within {LINE_LIMIT_S:g} s")
 
-    def _cancel_line_limit(self) -> None:
+    def _cancel_line_timer(self) -> None:
         """Cancel the time limit for an incomplete line, if there is one."""
-        if self._line_limit:
-            self._line_limit.cancel()
-            self._line_limit = None
+        if self._line_timer:
+            self._line_timer.cancel()
+            self._line_timer = None
 
     def _write(self, line: bytes) -> None:
         """Write a line to the stream, or disconnect the client if too much output is unsent."""
@@ -432,7 +432,7 @@ class ClientConnection(asyncio.Protocol):
             if self._bad_lines >= MAX_BAD_LINES or not self.admitted:
                 self.stream.close()
             return
-        self._first_limit.cancel()
+        self._first_timer.cancel()
         if not self.admitted:
             if not (isinstance(request, Status | Cancel) or (isinstance(request, Hello) and request.urgent)):
                 self.close_with(busy_greeting())

@@ -300,9 +300,9 @@ def _bind(path: str, mode: int) -> socket.socket:
 
 
 def _acquire_lock(path: str) -> int:
-    """Lock a socket's path, or raise AddressInUse if another server has locked it.
+    """Lock a socket's path and return the lock file's descriptor, or raise AddressInUse.
 
-    Return the descriptor of the lock file, which contains this process's id. Closing the descriptor ends the lock.
+    The file contains the id of this process. Closing the descriptor ends the lock.
     """
     while True:
         fd = _open_lock(f"{path}.lock")

@@ -109,7 +109,7 @@ class Server:
             voices=VoiceScheduler(settings.voice_memory * 1_000_000, VoiceCatalog.file_size),
         )
         self.speech = Speech(self._scheduler, settings.player_options)
-        self.speech.on_failure = self._end
+        self.speech.on_failure = self._begin_shutdown
         self.speech.voices.driver = settings.driver
         self._systemd = ServiceManager(self._loop, self.speech.status_words)
         self.speech.on_status_change = self._systemd.schedule_status
@@ -125,7 +125,7 @@ class Server:
         self._fatal_error: TalkError | None = None
         self._started_at = time.time(), time.monotonic()
         #: last logged reason why clients can't connect, or empty if they can
-        self._unreachable = ""
+        self._unreachable_reason = ""
         # A shell without job control starts background processes with SIGINT ignored. In this case, keep ignoring it.
         ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
         self._end_signals = [signal.SIGTERM] if ignored else [signal.SIGTERM, signal.SIGINT]
@@ -206,7 +206,7 @@ class Server:
         """
         self._socket_check = self._loop.call_later(SOCKET_CHECK_S, self._maintain_socket)
         if self._listener.in_place():
-            self._unreachable = ""
+            self._unreachable_reason = ""
             return
         try:
             former = self._listener.bind_again()
@@ -214,12 +214,12 @@ class Server:
             if not (self._listener.passed or is_temporary(error)):
                 # Clients can't reach this server any more, so shut down. A service manager may restart it.
                 log.write(log.sanitize(f"stopping: {error}"))
-                self._end(error)
-            elif str(error) != self._unreachable:
-                self._unreachable = str(error)
+                self._begin_shutdown(error)
+            elif str(error) != self._unreachable_reason:
+                self._unreachable_reason = str(error)
                 log.write(log.sanitize(f"clients can't reach this server: {error}"))
             return
-        self._unreachable = ""
+        self._unreachable_reason = ""
         log.write(f"created the socket {self._listener.path} again, because it or its lock was removed or replaced")
         self._acceptor.open(self._listener.socket)
         if former:
@@ -287,7 +287,7 @@ class Server:
 
     # -- shutdown
 
-    def _end(self, fatal: TalkError | None = None) -> None:
+    def _begin_shutdown(self, fatal: TalkError | None = None) -> None:
         """Start to shut down: end all goals and reject new ones.
 
         Args:
@@ -312,7 +312,7 @@ class Server:
         for each in self._end_signals:
             # A second signal ends the server immediately, without the event loop, which may be busy.
             signal.signal(each, self._on_second_signal)
-        self._end()
+        self._begin_shutdown()
 
     def _on_second_signal(self, number: int, _: object) -> None:
         """Close the socket and exit immediately.

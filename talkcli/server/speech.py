@@ -68,7 +68,7 @@ def unheard_chars(record: Record) -> int:
     return 0 if record.waits else len(record.say.text) - record.begun_end
 
 
-def elapsed() -> float:
+def monotonic_now() -> float:
     """Return a monotonic time that doesn't stop while the machine is suspended."""
     return time.clock_gettime(_CLOCK)
 
@@ -168,7 +168,7 @@ class Speech:
 
     def advance_time(self) -> Now:
         """Handle all time limits that have been reached, and return the current time."""
-        now = Now(elapsed(), time.time())
+        now = Now(monotonic_now(), time.time())
         if self.scheduler.deadline() <= now.monotonic:
             self.apply(self.scheduler.tick(now))
         return now
@@ -261,7 +261,7 @@ class Speech:
         """Publish a goal's new state. If it has ended, log it and resume waiting requests."""
         self.subscribers.state_changed(record, state, at)
         if state.terminal:
-            _log_goal_end(record, elapsed() - record.began_at)
+            _log_goal_end(record, monotonic_now() - record.began_at)
             resume_all(self._waiting_for_silence.pop(record, {}))
             resume_all(self._waiting_for_hearing.pop(record, {}))
 
@@ -272,7 +272,7 @@ class Speech:
         deadline = self.scheduler.deadline()
         self._timer = None
         if deadline < inf:
-            self._timer = self._loop.call_later(min(deadline - elapsed(), CLOCK_CHECK_S), self._tick)
+            self._timer = self._loop.call_later(min(deadline - monotonic_now(), CLOCK_CHECK_S), self._tick)
 
     def _tick(self) -> None:
         """Handle the time limits that have been reached, and set the timer for the next one."""

@@ -175,7 +175,7 @@ class Notifications:
         self._streams = streams
         self._pending: deque[Callable[[], None]] = deque()
         self._working = False
-        self._turn: asyncio.Handle | None = None
+        self._next_call: asyncio.Handle | None = None
         self._read_time_s = _READ_TIME_S
         #: called when the queue has become empty
         self.on_done: Callable[[], None] = lambda: None
@@ -195,7 +195,7 @@ class Notifications:
                 self._call(each)
             return
         self._pending.extend(notifications)
-        if self._turn is None:
+        if self._next_call is None:
             self._work(self._streams.unread_bytes)
 
     async def wait_done(self, request: PendingRequest) -> None:
@@ -210,7 +210,7 @@ class Notifications:
         Args:
             unread_before: the size of the unread output before the first call.
         """
-        self._turn = None
+        self._next_call = None
         self._working = True
         for _ in range(min(_MAX_CALLS_PER_TURN, len(self._pending))):
             self._call(self._pending.popleft())
@@ -222,16 +222,16 @@ class Notifications:
             self.on_done()
         elif self._streams.unread_bytes > unread_before + _UNREAD_LIMIT_BYTES:
             until = self._loop.time() + self._read_time_s
-            self._turn = self._loop.call_later(_READ_CHECK_S, self._await_readers, unread_before, until)
+            self._next_call = self._loop.call_later(_READ_CHECK_S, self._await_readers, unread_before, until)
         else:
-            self._turn = self._loop.call_soon(self._work, min(unread_before, self._streams.unread_bytes))
+            self._next_call = self._loop.call_soon(self._work, min(unread_before, self._streams.unread_bytes))
 
     def _await_readers(self, unread_before: int, until: float) -> None:
         """Continue `_work` once clients have read the new output, or at the time `until`."""
         if self._streams.unread_bytes <= unread_before:
             self._work(unread_before)
         elif self._loop.time() < until:
-            self._turn = self._loop.call_later(_READ_CHECK_S, self._await_readers, unread_before, until)
+            self._next_call = self._loop.call_later(_READ_CHECK_S, self._await_readers, unread_before, until)
         else:
             self._read_time_s *= _READ_TIME_FACTOR
             self._work(self._streams.unread_bytes)

@@ -102,7 +102,7 @@ def say(core: ClientCore, now: float = 0.0, **options: Any) -> TrackedGoal:
     """Say something without waiting for the answer, as `Client.say(block=False)` does."""
     request = Say("a", wait=True, id="g", **options)
     tracked = TrackedGoal(Goal("", State.PENDING))
-    tracked._expect(request, now)
+    tracked._set_request(request, now)
 
     def on_reply(reply: JsonObject, _: list[JsonObject]) -> None:
         tracked._accept(reply)

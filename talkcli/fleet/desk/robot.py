@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 _KEEP_ALIVE_INTERVAL_S = 30.0
 #: How many times a request may be sent again. The limit matters if the request itself breaks the connection.
 _MAX_RESENDS = 5
-#: The pause between two attempts to connect, if `keep_trying` is set.
+#: The pause between two attempts to connect, if `keep_trying_s` is set.
 _CONNECT_PAUSE_S = 0.25
 #: A new goal id begins with this many characters of the user name. An id has at most 64 characters.
 _ID_USER_CHARS = 48
@@ -85,7 +85,7 @@ class RobotConnection(Connection):
         *,
         name: str | None = None,
         interrupt: Mapping[int, int] | None = None,
-        patience: float = ANSWER_LIMIT_S,
+        patience_s: float = ANSWER_LIMIT_S,
         end: float | None = None,
         numbers: Iterator[int] | None = None,
     ) -> None:
@@ -96,14 +96,14 @@ class RobotConnection(Connection):
             desk: the connection to the broker. Its handler must pass the robot's messages to `on_message`.
             name: the name of the sender. The default is TALK_NAME.
             interrupt: file descriptors that interrupt any wait, as in `wait_ready`.
-            patience: the time in seconds within which the server must answer.
+            patience_s: the time in seconds within which the server must answer.
             end: the time limit for all answers (monotonic time), even if the robot is absent, or None for no limit.
             numbers: an iterator of request numbers, if several connections share one.
 
         Raises:
             UsageError: The name of the robot or the sender is not allowed.
         """
-        super().__init__(patience)
+        super().__init__(patience_s)
         if fault := topics.name_fault(robot):
             raise UsageError(f"invalid robot name '{printable(robot)}': it {fault}")
         self._sender = checked_sender_name(name)
@@ -428,13 +428,13 @@ class RobotConnection(Connection):
         self._desk.close(forked=os.getpid() != self._process)
 
 
-def connect_robot(robot: str, broker: Broker, *, keep_trying: float = 0.0, **options: Any) -> RobotConnection:
+def connect_robot(robot: str, broker: Broker, *, keep_trying_s: float = 0.0, **options: Any) -> RobotConnection:
     """Connect to a robot's server through the broker, and return the connection.
 
     Args:
         robot: the name of the robot.
         broker: the broker that the robot's bridge uses.
-        keep_trying: how long to keep trying in seconds if the broker can't be reached or the robot is offline.
+        keep_trying_s: how long to keep trying in seconds if the broker can't be reached or the robot is offline.
         options: other arguments of `RobotConnection`.
 
     Raises:
@@ -442,7 +442,7 @@ def connect_robot(robot: str, broker: Broker, *, keep_trying: float = 0.0, **opt
         AccessDenied: The broker rejected the login, or its certificate is not trusted.
         UsageError: The name of the robot or the sender is not allowed.
     """
-    give_up = time.monotonic() + keep_trying
+    give_up = time.monotonic() + keep_trying_s
     while True:
         desk = DeskLink(broker)
         try:

@@ -61,7 +61,7 @@ class FleetRequest:
         *,
         name: str | None = None,
         interrupt: Mapping[int, int] | None = None,
-        patience: float = ANSWER_LIMIT_S,
+        patience_s: float = ANSWER_LIMIT_S,
     ) -> None:
         """Connect to the broker, and send the request.
 
@@ -71,7 +71,7 @@ class FleetRequest:
             request: the request. It must refer to goals by their ids, because their numbers differ between robots.
             name: the name of the sender. The default is TALK_NAME.
             interrupt: file descriptors that interrupt any wait, as in `wait_ready`.
-            patience: the time in seconds within which the broker and each robot must answer.
+            patience_s: the time in seconds within which the broker and each robot must answer.
 
         Raises:
             UsageError: The selection or the request is not valid.
@@ -82,7 +82,7 @@ class FleetRequest:
         if selection.fault:
             raise UsageError(selection.fault)
         _check_request(request)
-        self._selection, self._name, self._interrupt, self._patience = selection, name, interrupt, patience
+        self._selection, self._name, self._interrupt, self._patience = selection, name, interrupt, patience_s
         #: all known robots by name, including those that came online too late to receive the request
         self._robots: dict[str, RobotRequest] = {}
         #: the names of the robots that the request is for, and of those that haven't finished yet
@@ -109,7 +109,7 @@ class FleetRequest:
             self.request = request
             #: the rejected goal, if the text is too long for any server. The request isn't sent then.
             self._rejected = too_long(request) if isinstance(request, Say) else None
-            self._desk.wait_for_retained(patience, interrupt=interrupt)
+            self._desk.wait_for_retained(patience_s, interrupt=interrupt)
             #: when the sentence expires (in `boottime`), or None if it never does
             self._latest = boottime() + request.ttl if isinstance(request, Say) and request.ttl else None
             self._began = True
@@ -329,7 +329,7 @@ class FleetRequest:
         """Return the RobotRequest for a robot. Create it if necessary."""
         if name not in self._robots:
             connection = RobotConnection(
-                name, self._desk, name=self._name, patience=self._patience, numbers=self._numbers
+                name, self._desk, name=self._name, patience_s=self._patience, numbers=self._numbers
             )
             self._robots[name] = RobotRequest(connection, self.request, self._record)
         return self._robots[name]
