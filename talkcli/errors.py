@@ -13,7 +13,7 @@ from __future__ import annotations
 EXIT_OK = 0
 EXIT_ERROR = 1
 EXIT_USAGE = 2
-EXIT_DIFFER = 13
+EXIT_DIFFER = 13  # several robots failed with different exit codes
 EXIT_TIMEOUT = 124  # the same exit code as timeout(1)
 EXIT_SIGNAL = 128  # add the signal's number, as a shell does
 EXIT_SIGINT = EXIT_SIGNAL + 2
@@ -151,12 +151,12 @@ _ERRORS_BY_CODE: dict[str, type[RequestRefused]] = {
 
 
 def refusal(code: str, message: str, items: list[dict[str, object]] | None = None) -> RequestRefused:
-    """Return the exception for an error code from the server."""
+    """Return the exception for an error reply and the list items that came before it."""
     return _ERRORS_BY_CODE.get(code, RequestRefused)(message, code, items)
 
 
-def memory_limits() -> str:
-    """Return advice about the memory limit of this process."""
+def memory_hint() -> str:
+    """Return a hint about this process's memory limit, for an error message."""
     import resource  # rarely needed, and slow to import
 
     # Each memory limit, its unit, and the shell command and systemd option that change it.

@@ -31,7 +31,7 @@ _COMPILE_AFTER_COUNT = 100
 
 @dataclass_transform(frozen_default=True)
 def frozen(cls: type[_T]) -> type[_T]:
-    """Turn a class into an immutable value class."""
+    """Return an immutable version of a class, like `@dataclass(frozen=True, slots=True)`."""
     # Annotations are strings, because every module has `from __future__ import annotations`.
     names = tuple(name for name, kind in cls.__annotations__.items() if not kind.startswith("ClassVar"))
     own = {name: each for name, each in cls.__dict__.items() if name not in {*names, "__dict__", "__weakref__"}}
@@ -40,7 +40,7 @@ def frozen(cls: type[_T]) -> type[_T]:
         "__slots__": names,
         "__match_args__": names,
         "_defaults": defaults,
-        "_made": 0,
+        "_instance_count": 0,
         "__qualname__": cls.__qualname__,
     }
     meta: Any = type(cls)
@@ -54,7 +54,7 @@ def fields(instance: object) -> dict[str, Any]:
 
 
 def replace(instance: _T, **changes: Any) -> _T:
-    """Return a copy with some fields changed. An unknown field raises TypeError."""
+    """Return a copy of an instance with some fields changed. An unknown field raises TypeError."""
     return type(instance)(**{**fields(instance), **changes})
 
 
@@ -67,10 +67,10 @@ class _Methods:
         names = cls.__match_args__
         given = dict(zip(names, arguments, strict=False))
         values = {**cls._defaults, **given, **named}
-        cls._made += 1
+        cls._instance_count += 1
         # The arguments are valid if they set each field exactly once.
         invalid = values.keys() != set(names) or len(given) != len(arguments) or not named.keys().isdisjoint(given)
-        if invalid or cls._made > _COMPILE_AFTER_COUNT:
+        if invalid or cls._instance_count > _COMPILE_AFTER_COUNT:
             cls.__init__ = _compile_init(cls)
             cls.__init__(self, *arguments, **named)  # raises the usual TypeError if the arguments are invalid
             return
@@ -102,7 +102,7 @@ _METHODS = {name: each for name, each in vars(_Methods).items() if callable(each
 
 
 def _compile_init(cls: Any) -> Any:
-    """Compile and return an `__init__` for a class.
+    """Compile a fast `__init__` for a class, and return it.
 
     It is five times as fast as the generic one.
     """

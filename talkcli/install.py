@@ -44,11 +44,8 @@ def command(*packages: str, reinstall: bool = False) -> str:
     return command_for(_inspect_environment(), packages, reinstall=reinstall)
 
 
-def neural(*more: str, reinstall: bool = False) -> str:
-    """Return the shell command that installs the packages for neural voices.
-
-    On a 32-bit system, return advice to use an espeak voice instead.
-    """
+def neural_command(*more: str, reinstall: bool = False) -> str:
+    """Return the command that installs neural voices' packages, or advice on a 32-bit system."""
     if not IS_64_BIT:
         return "neural voices need a 64-bit system; use an espeak voice, such as en"
     return command(*NEURAL_PACKAGES, *more, reinstall=reinstall)

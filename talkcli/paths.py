@@ -34,19 +34,16 @@ def named_socket(option: str | None) -> str | None:
 
 
 def named_robot(option: str | None, socket: str | None) -> str | None:
-    """Return the robot named by --robot or by TALK_ROBOT, if any.
+    """Return the robot named by --robot or, without --socket, by TALK_ROBOT.
 
-    TALK_ROBOT is ignored if --socket is given. Both options take precedence over the variables, and TALK_ROBOT over
+    Both options take precedence over the variables, and TALK_ROBOT over
     TALK_SOCKET.
     """
     return option or (None if socket else os.environ.get("TALK_ROBOT") or None)
 
 
 def client_sockets(named: str | None) -> list[str]:
-    """Return the socket paths that a client tries, in order.
-
-    If `named` is given, it is the only one.
-    """
+    """Return the socket paths that a client tries, in order, or only `named` if it is given."""
     if named:
         return [named]
     directories = [os.environ.get("XDG_RUNTIME_DIR"), *_runtime_directories(os.getuid())]
@@ -93,7 +90,7 @@ def sudo_caller(environment: Mapping[str, str]) -> int | None:
 
 
 def sudo_caller_socket() -> str | None:
-    """Return the socket path of the user who ran sudo, if there is one."""
+    """Return the path of an existing socket of the user who ran sudo, or None."""
     caller = sudo_caller(os.environ)
     if caller is None:
         return None
@@ -109,9 +106,7 @@ def sudo_caller_socket() -> str | None:
 
 
 def server_socket(named: str | None) -> str:
-    """Return the path for a server's socket.
-
-    For the default path, also create the directory.
+    """Return the path for a server's socket, and create the directory of the default path.
 
     Raises:
         AddressInUse: the directory is missing or not safe.
@@ -167,5 +162,5 @@ def cache_directory() -> str:
 
 
 def _user_directory(named: str | None, default: str) -> str:
-    """Return a directory if its path is absolute, or else the default."""
+    """Return the named directory if its path is absolute, or else the default with ~ expanded."""
     return named if named and os.path.isabs(named) else os.path.expanduser(default)

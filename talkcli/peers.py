@@ -47,13 +47,13 @@ def _decode_integer(data: bytes) -> int:
 
 
 def command_name(pid: int) -> str | None:
-    """Return the name of the program that a process runs."""
+    """Return the name of the program that a process runs, or None if it is unknown."""
     line = read_proc_file(f"/proc/{pid}/comm")
     return line.decode(errors="replace").rstrip("\n") if line else None
 
 
 def ancestors(pid: int) -> Iterator[int]:
-    """Yield the process ids of a process's nearest ancestors."""
+    """Yield the process ids of up to eight ancestors of a process, its parent first."""
     for _ in range(_MAX_ANCESTORS_COUNT):
         stat = process_stat(pid)
         pid = int(stat[1]) if stat else 0
@@ -63,10 +63,10 @@ def ancestors(pid: int) -> Iterator[int]:
 
 
 def parent_command_line(pid: int) -> str | None:
-    """Return the start of the command line of a process's parent.
+    """Return the start of the parent's command line, or None. Wrappers such as sudo are skipped.
 
-    Wrappers are skipped. Wrappers are programs that run another program. Of `timeout 5 talk say …`, the result is the
-    script that called `timeout`.
+    Wrappers are programs that run another program. For `timeout 5 talk say …`, the result is the script that called
+    `timeout`.
     """
     line = None
     for parent in ancestors(pid):
@@ -81,7 +81,7 @@ def parent_command_line(pid: int) -> str | None:
 
 
 def process_stat(pid: int) -> list[bytes]:
-    """Return the fields of /proc/PID/stat, starting with the state."""
+    """Return the fields of /proc/PID/stat from the state on, or an empty list on failure."""
     stat = read_proc_file(f"/proc/{pid}/stat") or b""
     # The program's name comes before the state, in brackets. The name itself can contain spaces and brackets.
     return stat.rpartition(b")")[2].split()

@@ -22,9 +22,7 @@ class Interrupted(Exception):
 def wait_ready(
     watched: Mapping[int, int], timeout: float | None, interrupt: Mapping[int, int] | None = None
 ) -> set[int]:
-    """Wait until descriptors are ready, and return them.
-
-    Raise Interrupted if one of `interrupt` is ready.
+    """Return the descriptors that become ready before the timeout, or raise Interrupted.
 
     Args:
         watched: the poll events to wait for, by descriptor. Errors and hang-ups always count.

@@ -47,9 +47,9 @@ def is_held(pipe: int, seconds: float = 0.0) -> bool:
 
 
 def kill_holders(pipe: int) -> bool:
-    """Kill all other processes that hold a pipe open.
+    """Kill all other processes that hold a pipe open, and return whether any was killed.
 
-    Return whether any was killed. Another user's process can't be killed, and without /proc no process can be found.
+    Another user's process can't be killed, and without /proc no process can be found.
     """
     if not is_held(pipe, _RELEASE_S):
         return False
@@ -85,7 +85,7 @@ def _read_links(folder: str) -> Iterator[str]:
 
 
 def _list_names(folder: str) -> list[str]:
-    """Return the names of the entries in a directory, if it can be read."""
+    """Return the names of the entries in a directory, or an empty list if it can't be read."""
     try:
         return os.listdir(folder)
     except OSError:  # the directory belongs to another user, or doesn't exist

@@ -164,7 +164,7 @@ def engine_fault(directory: Path, named: str | None = None) -> Finding:
         patch.syspath_prepend(directory)
         env = environment(str(directory), LD_LIBRARY_PATH=str(directory))
         finding = voice.judge_engine(
-            "2.99", voice.probe_engine(voice.EngineOptions(voice=named, env=env)), server=None
+            "2.99", voice.probe_engine(voice.EngineOptions(voice=named, env=env)), server_engine=None
         )[-1]
     assert finding.state == FAILURE
     return finding
@@ -299,7 +299,7 @@ def test_a_sound_server_is_found_by_its_program_or_its_socket(tmp_path: Path) ->
         (tmp_path / name).mkdir(parents=True)
     env = env_with(tmp_path / "pulse", pactl="printf 'Server Name: pulseaudio\\nDefault Sink: usb\\n'")
     sound_server = sound.find_sound_server(env, STRANGER)
-    assert (sound_server.name, sound_server.sink) == ("pulseaudio", "usb")
+    assert (sound_server.name, sound_server.default_sink) == ("pulseaudio", "usb")
     env = env_with(tmp_path / "pulse", pactl="echo Connection refused >&2; exit 1", pw_cli="exit 0")
     sound_server = sound.find_sound_server(env, STRANGER)
     assert ("PipeWire" in str(sound_server.name), sound_server.accepts_pulse) == (True, False)
@@ -323,20 +323,20 @@ def test_the_volume_is_read_from_the_active_mixer(tmp_path: Path) -> None:
     server, cards = SoundServer(name="PipeWire"), ("USB",)
     controls = "case $1 in scontrols) echo \"Simple mixer control 'Master',0\";; *) echo 'Mono: 0 [0%] [off]';; esac"
     env = env_with(tmp_path, amixer=controls, wpctl="echo 'Volume: 0.40 [MUTED]'")
-    (alsa,) = sound.check_levels(env, SoundServer(), cards, is_used=True)
+    (alsa,) = sound.check_levels(env, SoundServer(), cards, in_use=True)
     assert (alsa.message, alsa.next) == ("Master is muted", "amixer sset Master unmute")
-    (wire,) = sound.check_levels(env, server, cards, is_used=True)
+    (wire,) = sound.check_levels(env, server, cards, in_use=True)
     assert (wire.message, wire.next) == (
         "the default sink is muted", "wpctl set-mute @DEFAULT_AUDIO_SINK@ 0"
     )  # fmt: skip
     env = env_with(
         tmp_path, pactl="case $1 in get-sink-mute) echo Mute: no;; *) echo 'Volume: mono: 9 / 15% / x';; esac"
     )
-    (pulse,) = sound.check_levels(env, server, cards, is_used=True)
+    (pulse,) = sound.check_levels(env, server, cards, in_use=True)
     assert pulse.message == "the default sink is at 15%, which may be too quiet"
     assert pulse.next == "pactl set-sink-volume @DEFAULT_SINK@ 70%"
-    assert sound.check_levels(env, SoundServer(), (), is_used=True) == []
-    assert sound.check_levels(env, SoundServer(hangs=True), cards, is_used=True) == []
+    assert sound.check_levels(env, SoundServer(), (), in_use=True) == []
+    assert sound.check_levels(env, SoundServer(hangs=True), cards, in_use=True) == []
 
 
 # System files

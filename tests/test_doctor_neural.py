@@ -300,6 +300,6 @@ def test_a_failed_voice_is_a_warning_if_the_server_falls_back_to_espeak(
 
 
 def test_a_missing_package_is_reported_with_its_install_command() -> None:
-    message = f"the voice piper/a cannot be loaded: numpy is missing; install it with: {install.neural()}"
-    finding = voice.judge_engine("2.99", EngineReport(reason="unknown_voice", message=message), server=None)[-1]
-    assert (finding.check, finding.next) == ("voices", install.neural())
+    message = f"the voice piper/a cannot be loaded: numpy is missing; install it with: {install.neural_command()}"
+    finding = voice.judge_engine("2.99", EngineReport(reason="unknown_voice", message=message), server_engine=None)[-1]
+    assert (finding.check, finding.next) == ("voices", install.neural_command())

@@ -457,7 +457,7 @@ def test_a_neural_voice_is_refused_with_another_driver(env: dict[str, str]) -> N
 def test_without_the_extra_neural_voices_are_listed_but_refused(env: dict[str, str], tmp_path: Path) -> None:
     (tmp_path / "site" / "sitecustomize.py").write_text(WITHOUT.format(names=["onnxruntime"]))
     bare = {**env, "PYTHONPATH": str(tmp_path / "site")}
-    message = f"onnxruntime is missing; install it with: {install.neural()}"
+    message = f"onnxruntime is missing; install it with: {install.neural_command()}"
     done = run([*TALK, "serve", "--player", "null", "--voice", "piper/tiny"], bare)
     assert (done.code, message in done.err) == (2, True), done
     with serving(bare):

@@ -46,10 +46,10 @@ def run(arguments: list[str]) -> int:
 
 
 def _prepare_streams() -> None:
-    """Prepare the standard streams for any output.
+    """Open closed standard streams as /dev/null, and escape what the locale can't encode.
 
-    Closed streams are replaced by /dev/null. Characters that the locale can't encode are escaped. If file descriptor 0,
-    1 or 2 stayed closed, the next socket or lock file would get its number, and messages would be written to it.
+    If file descriptor 0, 1 or 2 stayed closed, the next socket or lock file would get its number, and messages would be
+    written to it.
     """
     for descriptor in (0, 1, 2):
         try:

@@ -145,7 +145,7 @@ def _report_pause(options: CommonOptions, goal: Goal | None, *, paused: bool, me
 
 
 def doctor(options: CommonOptions, silent: bool) -> int:
-    """Run the doctor's checks, and show the findings and the next step."""
+    """Run the doctor's checks, show the findings and the next step, and return the exit code."""
     from talkcli.cli.interrupts import Interrupts
     from talkcli.doctor.report import format_conclusion, format_finding, next_step
     from talkcli.goals.states import EXIT_CODES, State
@@ -169,7 +169,7 @@ def doctor(options: CommonOptions, silent: bool) -> int:
 def _create_examination(
     options: CommonOptions, interrupt: Mapping[int, int], *, silent: bool
 ) -> examine.LocalExamination | broker.BrokerExamination:
-    """Create the object that runs the doctor's checks."""
+    """Create the object that checks this machine or the selected robot."""
     robot = named_robot(options.robot, options.socket)
     if robot is None:
         from talkcli.doctor.examine import LocalExamination
@@ -196,7 +196,7 @@ def _show_canceled(done: Canceled, options: CommonOptions) -> None:
 
 
 def _suggest_key(key: str, client: Client) -> None:
-    """Suggest the key of an unfinished goal if it is similar."""
+    """Print the most similar key of an unfinished goal as a suggestion, if there is one."""
     from talkcli.terminal.text import printable
 
     try:

@@ -51,7 +51,7 @@ _FOREIGN_NAMES = {
 
 
 class _OptionType(click.FloatRange):
-    """The click type of options that are parsed by `read_value`.
+    """The click type that parses and checks the value of an option.
 
     It is derived from a range type so that help shows the limits of numbers.
     """
@@ -79,7 +79,7 @@ class _OptionType(click.FloatRange):
 
 
 def _make_click_option(option: Option, *, common: bool = False) -> click.Option:
-    """Create the click version of an option.
+    """Create a click option from an option's description.
 
     The value of a common option is stored in CommonOptions.
     """
@@ -109,7 +109,7 @@ def _click_type(option: Option) -> Any:
 
 
 def _make_click_argument(argument: Option) -> click.Argument:
-    """Create the click version of a command's positional argument."""
+    """Create a click argument from the description of a positional argument."""
     return click.Argument(
         [argument.name],
         nargs=-1 if argument.metavar.endswith("...") else 1,
@@ -120,15 +120,15 @@ def _make_click_argument(argument: Option) -> click.Argument:
     )
 
 
-def _make_completer(name: str) -> Callable[..., list[CompletionItem]] | None:
-    """Create the function with which click completes a value."""
+def _make_completer(completer: str) -> Callable[..., list[CompletionItem]] | None:
+    """Return the function with which click completes a value, or None without a completer."""
 
     def complete(context: click.Context, _: click.Parameter, incomplete: str) -> list[CompletionItem]:
         from talkcli.cli import completion
 
-        return completion.complete(name, context.find_root().obj, incomplete)
+        return completion.complete(completer, context.find_root().obj, incomplete)
 
-    return complete if name else None
+    return complete if completer else None
 
 
 def _store_common(context: click.Context, parameter: click.Parameter, value: object) -> None:
@@ -277,7 +277,7 @@ def talk(context: click.Context) -> None:
 
 
 def _first_screen(context: click.Context) -> str:
-    """Return the text to print if `talk` is run without a command.
+    """Return the overview to print if `talk` is run without a command.
 
     It leaves room for the next shell prompt on a terminal with 24 lines.
     """
@@ -291,7 +291,7 @@ def _first_screen(context: click.Context) -> str:
 
 
 def run(arguments: list[str]) -> int:
-    """Run a command line, or print its completions."""
+    """Run a command line, or print its completions, and return the exit code."""
     options = CommonOptions()
     if "_TALK_COMPLETE" in os.environ:
         from talkcli.cli import completion

@@ -84,7 +84,7 @@ class Command:
     exit_codes: ExitCodes | None = None
 
     def usage_fault(self, given: Mapping[str, Any], typed: frozenset[str], common: Mapping[str, Any]) -> str | None:
-        """Return an error message if options are invalid or can't be combined.
+        """Return an error message if options are invalid or can't be combined, or None.
 
         Args:
             given: the values of the command's own options and of its argument, by name.
@@ -126,10 +126,7 @@ class Command:
         return Selection(robot).fault
 
     def run(self, options: CommonOptions, given: Mapping[str, Any]) -> int | None:
-        """Run the command on this machine or on robots.
-
-        Return its exit code, or None for success.
-        """
+        """Run the command on this machine or on robots, and return its exit code or None."""
         options.urgent = self.urgent
         function = self.function or f"ask:{self.name}"
         robot = None if self._is_local(given) else named_robot(options.robot, options.socket)
@@ -204,7 +201,7 @@ def read_value(option: Option, text: str) -> Any:
     if kind in (INTEGER, NUMBER, SECONDS):
         return _parse_number(option, text)
     if kind is FILE_MODE:
-        return _parse_mode(text)
+        return _parse_file_mode(text)
     if kind in (WORD, ID):
         text = _as_utf8(text)
         bad = next(filter(is_bad_byte, text), None)
@@ -233,7 +230,7 @@ def _parse_number(option: Option, text: str) -> float:
     return value
 
 
-def _parse_mode(text: str) -> int:
+def _parse_file_mode(text: str) -> int:
     """Parse the file mode of a socket, or raise ValueError if it isn't suitable.
 
     The owner must be able to read and write, and nobody may have execute permission.
@@ -260,14 +257,12 @@ def _format_byte(character: str) -> str:
     return f"0x{ord(character) - 0xDC00:02x}"
 
 
-def replace_bad_bytes(text: str, first_line: int = 1) -> tuple[str, str | None]:
-    """Replace invalid bytes in a text with U+FFFD.
-
-    Return the text, and a message about the replaced bytes.
+def replace_bad_bytes(text: str, first_line_number: int = 1) -> tuple[str, str | None]:
+    """Return a text with invalid bytes replaced by U+FFFD, and a message about them or None.
 
     Args:
         text: the text, with invalid bytes decoded to surrogates.
-        first_line: the number of the text's first line.
+        first_line_number: the number of the text's first line.
 
     Returns:
         The text and the message. The message is None if all bytes were valid.
@@ -279,7 +274,7 @@ def replace_bad_bytes(text: str, first_line: int = 1) -> tuple[str, str | None]:
     if not found:
         return text, None
     first = found[0]
-    line = first_line + text.count("\n", 0, first)
+    line = first_line_number + text.count("\n", 0, first)
     column = first - text.rfind("\n", 0, first)
     words = f"line {line}, column {column}: the byte {_format_byte(text[first])} is not valid UTF-8 and is skipped"
     if len(found) > 1:

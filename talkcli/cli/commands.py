@@ -482,7 +482,7 @@ _ROWS = (
         talk fleet watch
         """,
         options=(replace(_LONG, help="Show full ids. 'status' also shows versions and start times."),),
-        argument=Option("what", WORD, metavar="WHAT", choices=("status", "watch")),
+        argument=Option("action", WORD, metavar="WHAT", choices=("status", "watch")),
     ),
     Command(
         name="completion",

@@ -51,7 +51,7 @@ _BASH_SPECIAL = re.compile(r"[^\w@%+=:,./-]")
 
 
 def print_completions(talk: click.Command, options: CommonOptions) -> int:
-    """Print completions for the line that the shell's completion script passes."""
+    """Print the completions that the shell's script asks for, and return the exit code."""
     try:
         click.echo("\n".join(_completion_lines(talk, options)).encode())
     except Exception:
@@ -73,8 +73,8 @@ def _completion_lines(talk: click.Command, options: CommonOptions) -> list[str]:
     return ["file" if each.type == "file" else format_line(words[-1], each.value, each.help) for each in found]
 
 
-def _format_for_bash(word: str, value: str, _: str | None) -> str:
-    """Quote the part of a value that bash will insert.
+def _format_for_bash(incomplete: str, value: str, _: str | None) -> str:
+    """Format the part of a value that bash will insert, and quote it.
 
     bash replaces the text in COMP_CWORD, which may be only the last part of the word.
     """
@@ -83,21 +83,21 @@ def _format_for_bash(word: str, value: str, _: str | None) -> str:
     if replaced in {":", "="}:
         replaced = ""  # after `sudo`, bash passes the separator instead of an empty word
     kept = "".join(split_arg_string(typed.removesuffix(replaced)))
-    return f"plain,{_quote_for_bash(_with_flag(value, word).removeprefix(kept), quote)}"
+    return f"plain,{_quote_for_bash(_with_flag(value, incomplete).removeprefix(kept), quote)}"
 
 
-def _format_for_zsh(_: str, value: str, words: str | None) -> str:
+def _format_for_zsh(_: str, value: str, help_text: str | None) -> str:
     """Format a value and its help text for zsh, which quotes the value itself."""
-    if not words:
+    if not help_text:
         return f"plain,{value}"
-    value, words = (each.replace("\\", "\\\\") for each in (value, words))
+    value, help_text = (each.replace("\\", "\\\\") for each in (value, help_text))
     value = value.replace(":", "\\:")
-    return f"described,{value}:{words}"
+    return f"described,{value}:{help_text}"
 
 
-def _format_for_fish(word: str, value: str, words: str | None) -> str:
+def _format_for_fish(incomplete: str, value: str, help_text: str | None) -> str:
     """Format a value and its help text for fish, which quotes the value itself."""
-    return f"plain,{_with_flag(value, word)}" + (f"\t{words}" if words else "")
+    return f"plain,{_with_flag(value, incomplete)}" + (f"\t{help_text}" if help_text else "")
 
 
 def completion(_: CommonOptions, shell: str) -> None:
@@ -125,20 +125,20 @@ def _last_word(line: str) -> tuple[str, str]:
     return word, quote
 
 
-def _with_flag(value: str, word: str) -> str:
+def _with_flag(value: str, incomplete: str) -> str:
     """Prefix a value with its flag if the incomplete word is --option=VALUE."""
-    option, equals, _ = word.partition("=")
+    option, equals, _ = incomplete.partition("=")
     return f"{option}={value}" if equals and option.startswith("-") else value
 
 
-def _quote_for_bash(value: str, quote: str) -> str:
-    """Escape a value for bash.
+def _quote_for_bash(value: str, open_quote: str) -> str:
+    """Escape a value for bash, which may follow an unclosed quotation mark.
 
-    `quote` is an unclosed quotation mark before it, or an empty string.
+    `open_quote` is an unclosed quotation mark before it, or an empty string.
     """
-    if quote == "'":
+    if open_quote == "'":
         return value.replace("'", "'\\''")
-    if quote:
+    if open_quote:
         return re.sub(r'(["\\$`])', r"\\\1", value)
     return _BASH_SPECIAL.sub(lambda found: f"\\{found[0]}", value)
 
@@ -244,10 +244,7 @@ def _request_status(options: CommonOptions) -> ServerStatus:
 
 
 def _offer_ids(goals: Iterable[Goal], status: ServerStatus, incomplete: str) -> Offers:
-    """Return the ids of goals as completions.
-
-    If the user has typed digits, add short ids such as 12.
-    """
+    """Return the ids of goals as completions, also in short form if digits were typed."""
     own = f"{status.server.get('boot')}-" if incomplete.isascii() and incomplete.isdecimal() else ""
     return [(name, _goal_help(each)) for each in goals for name in dict.fromkeys((each.id.removeprefix(own), each.id))]
 
@@ -268,6 +265,6 @@ def _goal_help(goal: Goal) -> str:
 
 
 def _voice_help(voice: JsonObject, field: str) -> str:
-    """Return the help text for a voice."""
+    """Return the help text for a voice, without the field that is offered as the value."""
     parts = [_shorten(str(voice.get(each) or "")) for each in ("name", "language") if each != field]
     return ", ".join(filter(None, parts)) or "voice"

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from talkcli.terminal.text import Screen
 
 
-def fleet(options: CommonOptions, what: str, long: bool) -> int | None:
+def fleet(options: CommonOptions, action: str, long: bool) -> int | None:
     """Show the robots of a fleet, or watch their events.
 
     Return the exit code, or None for success.
@@ -29,7 +29,7 @@ def fleet(options: CommonOptions, what: str, long: bool) -> int | None:
     broker = options.broker()
     text = paths.named_robot(options.robot, options.socket)
     selection = None if text is None else Selection(text)
-    if what == "watch":
+    if action == "watch":
         return _watch(options, broker, selection, long=long)
     from talkcli.fleet.desk.watch import read_robots
 

@@ -102,11 +102,10 @@ class Interrupts:
         os.close(self._write)
         return kind is Interrupted
 
-    def record(self, error: Interrupted | OSError) -> None:
-        """Record whether the output's reader is gone.
+    def handle_error(self, error: Interrupted | OSError) -> None:
+        """Record whether the output's reader is gone, or re-raise an unrelated error.
 
-        If it is, discard all output. Re-raise unrelated errors. The unrelated errors are those other than an interrupt,
-        a timeout or a missing reader.
+        If the reader is gone, discard all output. Errors are unrelated if they are neither an interrupt nor a timeout.
         """
         if isinstance(error, Interrupted | TimeoutError):
             self.reader_gone = STDOUT_FD in self.watched and not has_reader()

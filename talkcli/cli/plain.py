@@ -39,7 +39,7 @@ _EARLY_COMMANDS = ("say", "cancel", "status", "pause", "resume")
 
 @frozen
 class PlainCommand:
-    """A parsed command line."""
+    """A command line that was parsed without click."""
 
     command: Command
     #: the values of the command's own options and its argument, by name
@@ -59,7 +59,7 @@ def read(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand |
 
 
 def _parse(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand | None:
-    """Try to parse a command line without click."""
+    """Parse a command line without click, or return None or raise an error if that fails."""
     command: Command | None = None
     words: list[str] = []
     given: dict[str, Any] = {}
@@ -78,7 +78,7 @@ def _parse(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand
 
 
 def _flag_table(options: Iterable[Option]) -> Flags:
-    """Return a table of the flags and their options."""
+    """Return a table that maps each flag to its option and the value that it sets."""
     found: Flags = {}
     for option in options:
         yes, _, no = option.flags.partition("/")
@@ -89,7 +89,7 @@ def _flag_table(options: Iterable[Option]) -> Flags:
 
 
 def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, Any]) -> None:
-    """Parse an option, and store its value in `given`.
+    """Parse an option, with its argument from `rest` if needed, and store its value in `given`.
 
     Raises:
         KeyError, ValueError, StopIteration: click has to parse the option.
@@ -105,7 +105,7 @@ def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, 
 def _build_command(
     command: Command, given: dict[str, Any], words: list[str], environment: Mapping[str, str]
 ) -> PlainCommand | None:
-    """Create the command from its parsed options and argument."""
+    """Add defaults, check the options, and return the command, or None if click must parse it."""
     common = {name: given.pop(name) for name in _COMMON_NAMES & given.keys()}
     typed = frozenset(given)
     for option in command.options:
@@ -123,10 +123,10 @@ def _build_command(
     return None if command.usage_fault(given, typed, common) else PlainCommand(command, given, common, typed)
 
 
-def run(plain: PlainCommand) -> int:
-    """Run a parsed command, and return its exit code."""
+def run(parsed: PlainCommand) -> int:
+    """Send a command's request early if possible, run the command, and return its exit code."""
     started_at = time.monotonic()
-    command, given = plain.command.name, plain.given
+    command, given = parsed.command.name, parsed.given
     blocked: set[int] = set()
 
     def block_signals() -> None:
@@ -134,60 +134,58 @@ def run(plain: PlainCommand) -> int:
         wanted = {_signal.SIGINT, _signal.SIGTERM, _signal.SIGHUP} if command == "say" else set()
         blocked.update(wanted - _signal.pthread_sigmask(_signal.SIG_BLOCK, wanted))
 
-    early = _connect_early(plain, block_signals) if may_send_early(plain) else None
+    early = _connect_early(parsed, block_signals) if may_send_early(parsed) else None
     if early and early.request_sent and given.get("wait") and not given.get("feedback"):
         yield_processor(early, given["timeout"])
     from talkcli.cli.show import CommonOptions, run_command
 
     options = CommonOptions(
-        started_at=started_at, early=early, blocked_signals=blocked, typed=plain.typed, **plain.common
+        started_at=started_at, early=early, blocked_signals=blocked, typed=parsed.typed, **parsed.common
     )
-    return run_command(lambda: plain.command.run(options, given), options)
+    return run_command(lambda: parsed.command.run(options, given), options)
 
 
-def may_send_early(plain: PlainCommand) -> bool:
+def may_send_early(parsed: PlainCommand) -> bool:
     """Return whether the request may be sent before the rest of the program is imported.
 
     The command must use the local server, and must not need standard input, which may take any time to arrive.
     """
-    if named_robot(plain.common.get("robot"), plain.common.get("socket")):
+    if named_robot(parsed.common.get("robot"), parsed.common.get("socket")):
         return False
-    given = plain.given
+    given = parsed.given
     reads_input = given.get("lines") or given.get("stream") or given.get("text") == ("-",)
-    return plain.command.name in _EARLY_COMMANDS and not reads_input
+    return parsed.command.name in _EARLY_COMMANDS and not reads_input
 
 
-def _connect_early(plain: PlainCommand, before_sending: Callable[[], None]) -> ConnectionAttempt | None:
-    """Connect to the server, and send the request if the server answers soon.
-
-    Return the attempt.
+def _connect_early(parsed: PlainCommand, before_sending: Callable[[], None]) -> ConnectionAttempt | None:
+    """Connect to the server, send the request if it can be sent early, and return the attempt.
 
     Args:
-        plain: the command.
+        parsed: the command.
         before_sending: called immediately before the request is sent.
 
     Returns:
         The connection attempt, or None if the connection broke before anything was sent.
     """
-    early = reach(named_socket(plain.common.get("socket")))
+    early = reach(named_socket(parsed.common.get("socket")))
     if early.socket is None:
         return early
     # Connect before creating the messages, so that the server can send its greeting in the meantime.
-    messages = early_messages(plain)
+    messages = early_messages(parsed)
     return send_early(early, *messages, before_sending) if messages else early
 
 
-def early_messages(plain: PlainCommand) -> tuple[JsonObject, JsonObject] | None:
-    """Return a command's hello and request messages if they can be sent early."""
-    command, name = plain.command, sender_name(plain.given.get("name"))
-    request = _early_request(command.name, plain.given)
+def early_messages(parsed: PlainCommand) -> tuple[JsonObject, JsonObject] | None:
+    """Return a command's hello and request messages, or None if they can't be sent early."""
+    command, name = parsed.command, sender_name(parsed.given.get("name"))
+    request = _early_request(command.name, parsed.given)
     if request is None or len(name or "") > MAX_SENDER_NAME_CHARS:
         return None
     return hello(name, urgent=command.urgent), request
 
 
 def _early_request(command: str, given: dict[str, Any]) -> JsonObject | None:
-    """Return a command's request message if it is simple enough to send early."""
+    """Return a command's request message, or None if it isn't simple enough to send early."""
     from talkcli.protocol.lines import request_to_json
 
     if command == "say":

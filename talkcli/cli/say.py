@@ -72,7 +72,7 @@ def say(
         return found  # nothing can be spoken
     sentence = replace_and_report_bad_bytes(found, options)
     if output is not None:
-        return _write_file(output, sentence, goal_options, timeout, options)
+        return _write_wav_file(output, sentence, goal_options, timeout, options)
     with Interrupts(blocked=options.blocked_signals, output=wait) as interrupts:
         try:
             with options.connect(timeout, name=name, interrupt=interrupts.watched) as client:
@@ -112,10 +112,7 @@ def _read_input(
 
 
 def replace_and_report_bad_bytes(text: str, options: CommonOptions) -> str:
-    """Replace invalid UTF-8 in a text.
-
-    Print a message about the change unless --quiet is given.
-    """
+    """Replace invalid UTF-8 in a text, and print a message about it unless --quiet is given."""
     text, problem = replace_bad_bytes(text)
     if problem and not options.quiet:
         note(problem)
@@ -134,13 +131,10 @@ def _report_sent(goal: GoalHandle, options: CommonOptions, reporter: GoalReporte
     return code if goal.state.terminal else EXIT_OK
 
 
-def _write_file(
+def _write_wav_file(
     path: str, text: str, goal_options: Mapping[str, Any], timeout: float | None, options: CommonOptions
 ) -> int:
-    """Write the speech to a file, or to standard output if the path is "-".
-
-    Return the exit code.
-    """
+    """Write a text's speech to a file, or to standard output for "-", and return the exit code."""
     from talkcli.engine.parent.render import STANDARD_OUTPUT, render
 
     settings, seconds_at_most = _sound_settings(goal_options), seconds_left(options.deadline(timeout))

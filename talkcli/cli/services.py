@@ -158,7 +158,7 @@ def _print_unit(
         **values,
     )
     show(unit.rstrip("\n"))
-    hidden = _find_inaccessible(files) if kind == "system" else None
+    hidden = _find_inaccessible_file(files) if kind == "system" else None
     if hidden:
         file, directory = hidden
         note(
@@ -189,8 +189,8 @@ def _format_option(option: Option, value: object) -> str:
     return f"{long_flag(option)}={value:04o}" if option.kind is FILE_MODE else f"{long_flag(option)}={value}"
 
 
-def _find_inaccessible(files: Sequence[str]) -> tuple[str, str] | None:
-    """Find a file that other users can't reach, and the directory that blocks them."""
+def _find_inaccessible_file(files: Sequence[str]) -> tuple[str, str] | None:
+    """Return the first file that other users can't reach, and the directory that blocks them."""
     for path in files:
         steps = path.split(os.sep)
         for count in range(2, len(steps)):
@@ -215,7 +215,7 @@ def _escape_match(found: re.Match[str]) -> str:
 
 
 def _escape_path(path: str) -> str:
-    """Escape a path for a setting in a systemd unit."""
+    """Escape a path for a systemd unit, or raise UsageError if a unit can't contain it."""
     if re.search(_UNSAFE_CHARACTERS, path) or path.endswith(("\\", " ")):
         raise UsageError(
             f"a socket unit can't contain the path {printable(path)}; choose one without control characters"

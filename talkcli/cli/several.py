@@ -102,18 +102,17 @@ def resume(options: CommonOptions) -> int:
 
 
 def _send_request(
-    options: CommonOptions, request: Request, timeout: float | None = None, name: str | None = None
+    options: CommonOptions, request: Request, timeout: float | None = None, sender_name: str | None = None
 ) -> int:
-    """Send a request to the robots, and print the outcomes.
+    """Send a request to the selected robots, print the outcomes, and return the exit code.
 
-    Cancel its goals if interrupted. Goals are only cancelled if the command waits for goals that it has sent itself. A
-    timeout also interrupts the wait.
+    After an interrupt or a timeout, cancel the goals if the command waits for goals that it has sent itself.
 
     Args:
         options: the options of every command.
         request: the request.
         timeout: seconds for the whole command; None for no limit.
-        name: the sender's name.
+        sender_name: the sender's name.
     """
     owns_goals = isinstance(request, Say) and request.wait
     printer = _OutcomePrinter(options, request)
@@ -125,13 +124,13 @@ def _send_request(
         selection = Selection(paths.named_robot(options.robot, options.socket) or "")
         patience_s = min(ANSWER_LIMIT_S, timeout or ANSWER_LIMIT_S)
         with FleetRequest(
-            broker, selection, request, name=name, interrupt=interrupts.watched, patience_s=patience_s
+            broker, selection, request, name=sender_name, interrupt=interrupts.watched, patience_s=patience_s
         ) as fleet_request:
             try:
                 printer.show_outcomes(fleet_request, seconds_left(options.deadline(timeout)))
                 return printer.summarize(fleet_request)
             except (Interrupted, OSError) as error:
-                interrupts.record(error)
+                interrupts.handle_error(error)
                 is_late = isinstance(error, TimeoutError)
             if owns_goals:
                 _cancel_goals(fleet_request, interrupts, printer)
@@ -173,15 +172,15 @@ class _OutcomePrinter:
         try:
             self._show_count(fleet_request)
             for each in fleet_request.results(timeout):
-                self._record(each)
+                self._record_outcome(each)
                 self._clear_count()
                 self._print_outcome(each)
                 self._show_count(fleet_request)
         finally:
             self._clear_count()
 
-    def _record(self, outcome: Outcome) -> None:
-        """Store a robot's latest outcome.
+    def _record_outcome(self, outcome: Outcome) -> None:
+        """Store a robot's outcome, but keep the first failure that it reported.
 
         An earlier failure is only replaced if it seemed to be final.
         """
@@ -192,9 +191,7 @@ class _OutcomePrinter:
         self._outcomes[outcome.robot] = outcome
 
     def summarize(self, fleet_request: FleetRequest, unfinished_label: str = "not done") -> int:
-        """Print how many robots succeeded, and why the others failed.
-
-        Return the exit code.
+        """Print how many robots succeeded and why others failed, and return the exit code.
 
         Args:
             fleet_request: the request.

@@ -12,7 +12,7 @@ import sys
 import time
 
 from talkcli import __version__, paths
-from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, EXIT_SIGPIPE, ServerUnavailable, TalkError, TimedOut, memory_limits
+from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, EXIT_SIGPIPE, ServerUnavailable, TalkError, TimedOut, memory_hint
 from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -144,7 +144,7 @@ def run_command(command: Callable[[], object], options: CommonOptions) -> int:
     except KeyboardInterrupt:
         return EXIT_SIGINT
     except MemoryError:
-        note(f"not enough memory for talk: {memory_limits()}")
+        note(f"not enough memory for talk: {memory_hint()}")
         return EXIT_ERROR
     except Exception as error:
         output_code = handle_output_error(error)
@@ -211,9 +211,9 @@ def _is_read_only(error: OSError) -> bool:
 
 
 def show_if_possible(write: Callable[..., None], *given: object) -> None:
-    """Call a function that writes output.
+    """Call a function that writes output, and continue if the disk is full or broken.
 
-    If the disk is full or broken, report this and continue.
+    A full or broken disk is reported.
 
     Raises:
         OSError: the reader of the output is gone.
@@ -226,10 +226,7 @@ def show_if_possible(write: Callable[..., None], *given: object) -> None:
 
 
 def retry_without_output(write: Callable[..., _T], *given: Any) -> _T:
-    """Call a function and return its result.
-
-    If nothing reads its output, discard all output and call it again.
-    """
+    """Call a function. If nothing reads its output, discard output and call the function again."""
     try:
         return write(*given)
     except OSError as error:
@@ -269,10 +266,7 @@ def show_json(message: JsonObject) -> None:
 
 
 def show_result(options: CommonOptions, items: Iterable[JsonObject], lines: Callable[[], Iterable[str]]) -> None:
-    """With --json, print `items` as JSON objects.
-
-    Otherwise, print the lines that `lines` returns.
-    """
+    """With --json, print `items` as JSON objects, or else the lines that `lines` returns."""
     if options.json:
         for item in items:
             show_json(item)

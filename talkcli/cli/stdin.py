@@ -105,7 +105,7 @@ class InputLine:
     #: the size of the line in bytes if it is too long to be spoken, otherwise 0
     oversize_bytes: int = 0
     #: the monotonic time at which the line expires
-    end: float = _NO_LIMIT
+    expires_at: float = _NO_LIMIT
 
 
 class LineBuffer:
@@ -136,7 +136,7 @@ class LineBuffer:
 
     @property
     def first(self) -> InputLine | None:
-        """The oldest line that isn't blank."""
+        """The oldest line that isn't blank, or None."""
         while not self._lines and self._chunks:
             now, data = self._chunks.popleft()
             self.size -= len(data)
@@ -158,16 +158,13 @@ class LineBuffer:
         A call yields at most 1,000, so that the caller can check for signals.
         """
         for _ in range(_MAX_EXPIRED_LINES):
-            if not self.first or self.first.end > now:
+            if not self.first or self.first.expires_at > now:
                 break
             yield self.take()
 
 
 def _read_available() -> bytes | None:
-    """Return data from standard input.
-
-    It is b"" at the end of the input, and None if reading would block.
-    """
+    """Read what standard input has now. Return b"" at its end, or None if it would block."""
     try:
         return os.read(0, _STDIN_READ_BYTES)
     except BlockingIOError:  # another program has made standard input non-blocking
@@ -236,7 +233,7 @@ class InputSpeaker:
         raise NotImplementedError
 
     def _await_input(self, wait: Callable[[], object], *, wants_input: bool) -> bytes | None:
-        """Call a function that waits, and return the input that interrupts it.
+        """Call a function that waits, and return the input that interrupts it, or None.
 
         Args:
             wait: the function.
@@ -307,7 +304,7 @@ class LineSpeaker(InputSpeaker):
                     self._error = error
         except (Interrupted, OSError) as error:
             interrupts = self._interrupts
-            interrupts.record(error)
+            interrupts.handle_error(error)
             self._stop_early()
             if interrupts.signal_number is None and not interrupts.reader_gone:
                 raise timeout_error(self._timeout) from None
@@ -362,7 +359,7 @@ class LineSpeaker(InputSpeaker):
             now = time.monotonic()
             for line in self._buffer.take_expired(now):
                 self._report_expired(line)
-            while self._buffer.first and self._buffer.first.end > now and not (self._unanswered or self._full):
+            while self._buffer.first and self._buffer.first.expires_at > now and not (self._unanswered or self._full):
                 self._send_line(self._buffer.take())
             if self._done:
                 return
@@ -370,7 +367,7 @@ class LineSpeaker(InputSpeaker):
             raise TimeoutError
         self._wait_for_news()
         self._process_answer()
-        self._report_goals()
+        self._report_and_forget_goals()
         if self._connection.ended is not None and self._error is None and self._has_lines:
             path = self._connection.path
             raise ServerUnavailable(f"lost the connection to the server at {path}: {self._connection.ended}")
@@ -392,7 +389,7 @@ class LineSpeaker(InputSpeaker):
             self._feedback.note(problem)
         goal_options = self._goal_options
         if self._ttl:
-            goal_options = {**goal_options, "ttl": max(MIN_TTL_S, round(line.end - time.monotonic(), 2))}
+            goal_options = {**goal_options, "ttl": max(MIN_TTL_S, round(line.expires_at - time.monotonic(), 2))}
         # Follow the goal even without --wait, to find out when it is no longer pending.
         request = Say(text, wait=True, feedback=self._feedback.shows_events, patient=True, **goal_options)
         handle, accepted = self._client._create_handle(request)
@@ -439,24 +436,21 @@ class LineSpeaker(InputSpeaker):
         if self._wait:
             self._record_failure(line.number, code)
 
-    def _record_failure(self, number: int, code: int) -> None:
+    def _record_failure(self, line_number: int, exit_code: int) -> None:
         """Record a line's exit code if it is the first failure."""
-        if code and (self._failure is None or number < self._failure[0]):
-            self._failure = number, code
+        if exit_code and (self._failure is None or line_number < self._failure[0]):
+            self._failure = line_number, exit_code
 
     def _call_writer(self, write: Callable[..., _T], *given: object) -> _T:
-        """Call a function that writes output, and return its result.
-
-        Without --wait, ignore a missing reader.
-        """
+        """Call a function that writes output. Without --wait, a missing reader is ignored."""
         return write(*given) if self._wait else retry_without_output(write, *given)
 
     # Waiting for input and for the server
 
     def _wait_for_news(self) -> None:
-        """Wait for input or a message from the server, until the next deadline."""
+        """Wait for a message from the server or for input, and add the input to the buffer."""
         first = self._buffer.first
-        end = min(first.end, self._end) if first and self._error is None else self._end
+        end = min(first.expires_at, self._end) if first and self._error is None else self._end
         was_full = self._full
 
         def has_news() -> bool:
@@ -478,10 +472,10 @@ class LineSpeaker(InputSpeaker):
             if not idle:  # read from the server even if there is always more input
                 wait(time.monotonic(), interruptible=False)
 
-    def _report_goals(self) -> None:
-        """Forget goals that have ended.
+    def _report_and_forget_goals(self) -> None:
+        """Report events of the goals if --wait is given, and forget goals that have ended.
 
-        With --wait, first report their events in the order of the lines.
+        Events are reported in the order of the lines.
         """
         if not self._wait:
             self._goals = deque(each for each in self._goals if not each[1].state.terminal)
@@ -500,7 +494,7 @@ class LineSpeaker(InputSpeaker):
     # Stopping before the end of the input
 
     def _stop_early(self) -> None:
-        """Cancel the goals with --wait, and report the first unsent line."""
+        """Cancel the goals if --wait is given, and report the first unsent line."""
         if self._wait:
             # Close the connection first. Otherwise, a line that is waiting for room in the queue would be accepted when
             # the other goals are cancelled.
@@ -510,7 +504,7 @@ class LineSpeaker(InputSpeaker):
         self._report_unsent()
 
     def _cancel_goals(self, ids: list[str]) -> None:
-        """Cancel all goals of this process, and report how they ended."""
+        """Cancel these goals and any others of this process, and report how they ended."""
         self._options.urgent = True
         try:
             with self._options.connect(CANCEL_TIMEOUT_S, interrupt=self._interrupts.watched, end=None) as client:

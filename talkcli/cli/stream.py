@@ -40,7 +40,7 @@ class InputDecoder:
         self.problem: str | None = None
 
     def decode(self, data: bytes) -> str:
-        """Return the text that follows from the next bytes.
+        """Decode the next bytes, and return the text that can be sent now.
 
         Empty bytes mark the end of the input.
         """
@@ -113,9 +113,9 @@ class StreamSpeaker(InputSpeaker):
         self._show_events(goal)
 
     def _add_input(self, data: bytes | None) -> None:
-        """Add input to the text.
+        """Add input to the goal's text, or end the text if `data` is empty.
 
-        Empty data means the end of the input. None means that no input has arrived.
+        `data` is None if no input has arrived.
         """
         if data is None:
             return

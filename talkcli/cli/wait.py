@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 CANCEL_TIMEOUT_S = 1.0
 
 
-def seconds_left(end: float | None) -> float | None:
-    """Return the number of seconds left until a deadline."""
-    return None if end is None else max(0.0, end - time.monotonic())
+def seconds_left(deadline: float | None) -> float | None:
+    """Return the number of seconds left until a deadline, or None if there is none."""
+    return None if deadline is None else max(0.0, deadline - time.monotonic())
 
 
 def timeout_error(timeout: float | None, details: str = "") -> TimedOut:
@@ -56,7 +56,7 @@ class GoalReporter:
             self.feedback = make_feedback(options)
 
     def show_accepted(self, goal: GoalHandle, pause_known: bool = False) -> None:
-        """Print the id of an accepted goal, and tell the user if speech is paused.
+        """Print the id of an accepted goal, and say if speech is paused.
 
         `pause_known` means that the user has already been told.
         """
@@ -92,10 +92,9 @@ class GoalReporter:
         return self.report(goal, prefix)
 
     def report(self, goal: Goal, prefix: str = "") -> int:
-        """With --json, print a goal.
+        """Print a goal as JSON, or why it failed, and return its exit code.
 
-        If it failed, print why. Return its exit code, or 124 if it is unfinished. `prefix` is put in front of any
-        message.
+        The exit code of an unfinished goal is 124. `prefix` is put in front of any message.
         """
         if self._options.json and not self.feedback.shows_events:
             show_if_possible(show_json, goal.to_json())
@@ -132,9 +131,9 @@ class GoalReporter:
         retry_without_output(self.report, goal.goal)
 
     def wait_for(self, goal: GoalHandle, interrupts: Interrupts, timeout: float | None, follow: Follow) -> int:
-        """Wait until a goal has ended, report it, and return the exit code.
+        """Wait until a goal has ended, or cancel it on an interrupt, and return the exit code.
 
-        Cancel it on an interrupt or timeout. If an earlier command has already sent a goal with the same id, that goal
+        A timeout also cancels it. If an earlier command has already sent a goal with the same id, that goal
         isn't cancelled.
 
         Args:
@@ -150,7 +149,7 @@ class GoalReporter:
             self.show_accepted(goal)
             follow(goal)
         except (Interrupted, OSError) as error:
-            interrupts.record(error)
+            interrupts.handle_error(error)
             timed_out = interrupts.signal_number is None and not interrupts.reader_gone
             if not goal.attached:
                 self.cancel(goal, interrupts)

@@ -41,9 +41,9 @@ class RateLimit:
         self._event_count = 0
 
     def count_event(self, now: float) -> int | None:
-        """Count an event.
+        """Count an event, and return the number suppressed before it, or None to suppress it.
 
-        Return how many events have been suppressed since the last allowed event, or None to suppress this one.
+        Only the events that have been suppressed since the last allowed event are counted.
         """
         if now >= self._period_end:
             suppressed = max(0, self._event_count - self._max_events)
@@ -60,9 +60,9 @@ _rate_limits: dict[str, RateLimit] = {}
 
 
 def write(message: str) -> None:
-    """Write a line to the log.
+    """Write a line to the log, or count it as lost if that would block.
 
-    The line is dropped if standard error can't accept it at once.
+    The next line that is written gives the number of lost lines.
     """
     global _lost_lines  # noqa: PLW0603
     if _lost_lines:

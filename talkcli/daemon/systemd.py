@@ -60,7 +60,7 @@ class ServiceManager:
         self._notify_watchdog()
 
     def schedule_status(self) -> None:
-        """Schedule a report of the process's status."""
+        """Report the process's status to the service manager after a short delay."""
         self._schedule("status", STATUS_DELAY_S, self._notify_status)
 
     def notify_stopping(self) -> None:
@@ -69,7 +69,7 @@ class ServiceManager:
             self._send(STOPPING="1", STATUS="stopping")
 
     def close(self) -> None:
-        """Stop all notifications."""
+        """Stop all notifications, and close the socket."""
         for timer in self._timers.values():
             timer.cancel()
         self._timers.clear()
@@ -101,7 +101,7 @@ class ServiceManager:
         self._timers[name] = self._loop.call_later(seconds, act)
 
     def _send(self, **fields: str) -> None:
-        """Send these fields and any unsent ones, and retry later if this fails."""
+        """Send a notification with these fields and any unsent ones, and retry later if this fails."""
         if self._socket is None:
             return
         self._status = fields.get("STATUS", self._status)

@@ -125,16 +125,16 @@ class BrokerExamination:
         elif self._is_robot:
             presence_finding = ok("name", f"the name '{self._robot}' is free: no bridge has used it")
         else:
-            has_rights = rights_finding.state != FAILURE
-            known = sorted(presences) if has_rights else []
-            presence_finding = judge_unknown_robot(self._robot, known, name, has_rights=has_rights)
+            has_other_rights = rights_finding.state != FAILURE
+            known = sorted(presences) if has_other_rights else []
+            presence_finding = judge_unknown_robot(self._robot, known, name, has_other_rights=has_other_rights)
         yield presence_finding
         yield rights_finding
         if not self._is_robot and FAILURE not in (presence_finding.state, rights_finding.state):
-            yield self._ask_robot(broker)
+            yield self._check_robot_server(broker)
 
     def _check_connection(self, broker: Broker, context: ssl.SSLContext | None) -> Iterator[Finding]:
-        """Check the connection to the broker and the broker's certificate."""
+        """Connect to the broker, check its certificate, and yield the findings."""
         began = time.monotonic()
         try:
             connection = self._wait_for(partial(socket.create_connection, (broker.host, broker.port), LOGIN_LIMIT_S))
@@ -155,7 +155,7 @@ class BrokerExamination:
             yield judge_certificate(broker, expires_at, time.time())
 
     def _log_in(self, broker: Broker) -> Link:
-        """Log in to the broker, and return the connection.
+        """Log in to the broker, and return the open connection.
 
         Raises the same errors as `Link.open`.
         """
@@ -168,10 +168,7 @@ class BrokerExamination:
         return link
 
     def _check_anonymous(self, broker: Broker) -> Finding:
-        """Try to log in without credentials.
-
-        The finding is a warning if the broker allows this.
-        """
+        """Return a finding on whether the broker accepts a login without credentials."""
         try:
             self._log_in(replace(broker, user=None, password=None, cert=None, key=None)).close()
         except TalkError:
@@ -184,9 +181,9 @@ class BrokerExamination:
         )
 
     def _test_rights(self, link: Link, user: str) -> tuple[Finding, dict[str, Presence]]:
-        """Test the user's access rights by publishing messages.
+        """Test the user's access rights, and return the finding and the robots' presence messages.
 
-        Return the finding, and the presences of robots by name. The user needs the rights of an operator, or those of
+        The user needs the rights of an operator, or those of
         this robot's bridge. Other robots are only read if this robot's presence is missing, and the user isn't the
         robot.
         """
@@ -226,8 +223,8 @@ class BrokerExamination:
         unreadable = () if is_back or echo in unwritable else (echo,)
         return judge_rights(user, unwritable, unreadable, trouble), presences
 
-    def _ask_robot(self, broker: Broker) -> Finding:
-        """Check whether the robot's server answers a status request."""
+    def _check_robot_server(self, broker: Broker) -> Finding:
+        """Request the status of the robot's server, and return the finding about the answer."""
         end = time.monotonic() + _STEP_LIMIT_S
         try:
             connection = connect_robot(
@@ -243,7 +240,7 @@ class BrokerExamination:
             return failure("bridge", wrong, remedy or step)
 
     def _wait_for(self, function: Callable[[], _Result]) -> _Result:
-        """Run a blocking function in a thread with a time limit.
+        """Run a blocking function in a thread, and return its result or raise TimeoutError.
 
         Raises:
             TimeoutError: The work takes too long. The thread continues, but its result is ignored.
@@ -286,7 +283,7 @@ def _explain_error(error: OSError | UnicodeError) -> str:
 
 
 def judge_settings(message: str, *, has_url: bool) -> Finding:
-    """Return the finding about invalid broker settings.
+    """Return the finding about broker settings that are invalid or lack the URL.
 
     Args:
         message: the error message.
@@ -307,7 +304,7 @@ def judge_unreachable(broker: Broker, reason: str) -> Finding:
 
 
 def judge_certificate(broker: Broker, expires_at: float | None, now: float) -> Finding:
-    """Return the finding about the broker's certificate.
+    """Return the finding about the expiry of the broker's certificate, or about missing TLS.
 
     Args:
         broker: the broker.
@@ -326,44 +323,44 @@ def judge_certificate(broker: Broker, expires_at: float | None, now: float) -> F
     return ok("certificate", f"trusted by {_describe_cas(broker)}; valid until {date}")
 
 
-def judge_tls_error(broker: Broker, message: str, code: int, now: float) -> Finding:
+def judge_tls_error(broker: Broker, message: str, verify_code: int, now: float) -> Finding:
     """Return the finding about a failed TLS connection.
 
     Args:
         broker: the broker.
         message: the error message.
-        code: OpenSSL's error code if the certificate was rejected, otherwise 0.
+        verify_code: OpenSSL's error code if the certificate was rejected, otherwise 0.
         now: the current time in seconds since 1970.
     """
-    step = _advise_on_tls_error(broker, message, code, now)
+    step = _advise_on_tls_error(broker, message, verify_code, now)
     return failure("certificate", f"{message} (checked against {_describe_cas(broker)})", step)
 
 
 def _describe_cas(broker: Broker) -> str:
-    """Describe the CAs that the broker's certificate is checked against."""
+    """Return a description of the CAs that the broker's certificate is checked against."""
     return f"the CA in {broker.ca}" if broker.ca else "the system's CAs"
 
 
-def _advise_on_tls_error(broker: Broker, message: str, code: int, now: float) -> str:
+def _advise_on_tls_error(broker: Broker, message: str, verify_code: int, now: float) -> str:
     """Return advice on how to fix a TLS error.
 
     The arguments are those of `judge_tls_error`.
     """
-    if code in _DATE_CODES:
+    if verify_code in _DATE_CODES:
         clock = time.strftime("%Y-%m-%d %H:%M", time.gmtime(now))
         return f"renew the certificate of {broker.host}; or set this machine's clock, which shows {clock} UTC"
-    if code in _HOST_CODES:
+    if verify_code in _HOST_CODES:
         return f"use the host name of its certificate in {URL}, or get a certificate for {broker.host}"
     if "ALERT" in message:
         return "log in with a certificate that the broker accepts: set TALK_MQTT_CERT and TALK_MQTT_KEY"
-    if not code:
+    if not verify_code:
         return f"if port {broker.port} of {broker.host} has no TLS, use its TLS port in {URL}; otherwise, {_LOG_STEP}"
     file = "another file" if broker.ca else "a file"
     return f"set {CA} to {file} with the certificate of the CA that issued the certificate of {broker.host}"
 
 
 def judge_login(broker: Broker, refusal: str | None) -> Finding:
-    """Return the finding about the login.
+    """Return the finding about the login, which succeeded if `refusal` is None.
 
     `refusal` is the broker's reason for refusing it, or None.
     """
@@ -383,7 +380,7 @@ def judge_login(broker: Broker, refusal: str | None) -> Finding:
 
 
 def judge_presence(presence: Presence, now: float) -> Finding:
-    """Return the finding about a robot's presence message."""
+    """Return the finding about whether a robot and its server are online."""
     robot = presence.name
     if not presence.online:
         step = f"check its network and power; on {robot}, run: systemctl status talk-bridge"
@@ -400,14 +397,14 @@ def judge_presence(presence: Presence, now: float) -> Finding:
     return ok("name", f"{words}; its server is talk {server.get('version')}, process {server.get('pid')}")
 
 
-def judge_unknown_robot(robot: str, known_robots: list[str], user: str, *, has_rights: bool) -> Finding:
-    """Return the finding about a robot without a presence message.
+def judge_unknown_robot(robot: str, known_robots: list[str], user: str, *, has_other_rights: bool) -> Finding:
+    """Return the finding about a robot that the broker doesn't know.
 
     Args:
         robot: the robot's name.
         known_robots: the names of the robots that the broker knows.
         user: the user's name.
-        has_rights: whether the user has all other access rights.
+        has_other_rights: whether the user has all other access rights.
     """
     words = f"the broker knows no robot named '{robot}'"
     by_lower = {each.lower(): each for each in known_robots}
@@ -418,13 +415,13 @@ def judge_unknown_robot(robot: str, known_robots: list[str], user: str, *, has_r
     if known_robots:
         return failure("name", f"{words}; known robots: {join_names(known_robots)}", step)
     words += f", or '{user}' is not allowed to see it"
-    if not has_rights:
+    if not has_other_rights:
         return warning("name", words, f"give '{user}' the rights of an operator, and run talk doctor again")
     return failure("name", words, f"{step}; or add the access rules for '{user}': talk bridge --print-acl")
 
 
 def judge_rights(user: str, unwritable: tuple[str, ...], unreadable: tuple[str, ...], error: str | None) -> Finding:
-    """Return the finding about the user's access rights.
+    """Return the finding about the user's access rights to the broker's topics.
 
     Args:
         user: the user's name.
@@ -443,9 +440,9 @@ def judge_rights(user: str, unwritable: tuple[str, ...], unreadable: tuple[str, 
     return ok("rights", f"the broker gives '{user}' all the rights that are needed")
 
 
-def judge_server_status(robot: str, server: JsonObject, answer_s: float) -> Finding:
+def judge_server_status(robot: str, server: JsonObject, response_s: float) -> Finding:
     """Return the finding about the status of the robot's server."""
-    words = f"{robot} answered in {answer_s * 1000:.0f} ms: {summarize_server(server)}"
+    words = f"{robot} answered in {response_s * 1000:.0f} ms: {summarize_server(server)}"
     if server.get("paused") is True:
         return warning("bridge", f"speech is paused; {words}", f"talk --robot {robot} resume")
     if server.get("engine") not in WORKING_STATES:

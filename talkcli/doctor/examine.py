@@ -74,7 +74,7 @@ class LocalExamination:
                 yield finding
 
     def _run_checks(self, client: Client | None, socket_finding: Finding) -> Iterator[Finding]:
-        """Run all checks, and yield their findings.
+        """Run all checks with the client, if there is one, and yield their findings.
 
         The arguments are the results of `server.connect`.
         """
@@ -91,13 +91,13 @@ class LocalExamination:
         self._engine = voice.probe_engine(voice.EngineOptions(voice=voice_here, interrupt=self._interrupt))
         yield voice.judge_python()
         pyttsx3 = voice.installed_version("pyttsx3")
-        yield from voice.judge_engine(pyttsx3, self._engine, server=self._setting("engine"))
+        yield from voice.judge_engine(pyttsx3, self._engine, server_engine=self._setting("engine"))
         self._session, self._env = sound.find_session(self._server_pid)
         yield from self._check_neural()
         if client is not None and self._server_pid is None:
             yield sound.SESSION_ELSEWHERE
             if is_silent(self._player):
-                yield sound.judge_silent_player(self._player, by_server=True)
+                yield sound.judge_silent_player(self._player, set_by_server=True)
         elif sys.platform.startswith("linux"):
             yield sound.judge_session(self._session)
             yield from self._check_sound()
@@ -119,7 +119,7 @@ class LocalExamination:
         return self._setting("player", "TALK_PLAYER")
 
     def _check_neural(self) -> Iterator[Finding]:
-        """Check neural voices if one is installed or in use."""
+        """Yield findings about neural voices, if one is installed or in use."""
         used, engine, env = self._setting("voice", "TALK_VOICE"), self._engine, self._env
         reported = self._server.get("neural_voices")
         server_voices = reported if isinstance(reported, dict) else {}
@@ -138,14 +138,14 @@ class LocalExamination:
         yield from voice.check_neural(used, options, SENTENCE_LIMIT_S, server_voices if self._client else None)
 
     def _check_sound(self) -> Iterator[Finding]:
-        """Check everything between the engine and the loudspeaker."""
+        """Yield findings about the sound output, and record whether the sound server hangs."""
         env, session, device, by_server = self._env, self._session, self._setting("device"), self._client is not None
         if not is_own_driver(self._setting("driver")):
             return  # pyttsx3's other drivers play the sound themselves
         sound_server = sound.find_sound_server(env, session)
         self._hangs = sound_server.hangs
         if is_silent(self._player):
-            yield sound.judge_silent_player(self._player, by_server=by_server)
+            yield sound.judge_silent_player(self._player, set_by_server=by_server)
             return
         cards = sound.find_cards()
         program = next(iter(sound.installed_players(env)), None)
@@ -159,10 +159,10 @@ class LocalExamination:
         yield sound.check_cards(cards, sound_server, session)
         yield sound.check_access(sound_server, session)
         yield sound.judge_sound_server(sound_server, cards, session)
-        yield from sound.check_levels(env, sound_server, cards, is_used=device is None and used in PLAYERS)
+        yield from sound.check_levels(env, sound_server, cards, in_use=device is None and used in PLAYERS)
 
     def _speak_sentence(self) -> Finding:
-        """Speak the doctor's sentence, and return the finding about it."""
+        """Speak the doctor's test sentence, and return the finding about it."""
         client, engine, player = self._client, self._engine, self._player
         if client is not None and self._silent:
             if self._server_pid is None:
@@ -177,7 +177,7 @@ class LocalExamination:
             options = voice.EngineOptions(player, voice=used, interrupt=self._interrupt)
             result = sentence.speak_by_engine(SENTENCE_TEXT, options, 0.0 if self._silent else 1.0, SENTENCE_LIMIT_S)
         custom = sound.is_custom(player)
-        step = sentence.find_playback_step(self._findings, custom=custom)
+        step = sentence.find_playback_step(self._findings, custom_player=custom)
         if self._silent and self._server_pid is not None and self._session.server_pid is None:
             # The server belongs to another user, so its environment can't be read. If /proc is mounted with the option
             # hidepid, the server's owner is unknown too.
@@ -186,7 +186,9 @@ class LocalExamination:
         if result.reason == Reason.AUDIO_STALLED and not (self._hangs or custom):
             result = replace(result, suspended=sound.suspended_sinks(self._env))
         silent, device = self._silent or is_silent(player), self._setting("device")
-        return sentence.judge_sentence(result, silent=silent, device=device, playback_step=step, hangs=self._hangs)
+        return sentence.judge_sentence(
+            result, silent=silent, device=device, playback_step=step, sound_hangs=self._hangs
+        )
 
     def _copy_server_options(self, server_pid: int) -> voice.EngineOptions:
         """Return engine options with the server's player, device and voice."""

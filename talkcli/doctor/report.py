@@ -64,18 +64,12 @@ def ok(check: str, message: str) -> Finding:
 
 
 def warning(check: str, message: str, step: str) -> Finding:
-    """Return a finding about a fault that may prevent sound.
-
-    `step` is what the user should do next.
-    """
+    """Return a finding about a fault that may prevent sound, with the user's next step."""
     return Finding(check, WARNING, printable(message), printable(step))
 
 
 def failure(check: str, message: str, step: str) -> Finding:
-    """Return a finding about a fault that certainly prevents sound.
-
-    `step` is what the user should do next.
-    """
+    """Return a finding about a fault that certainly prevents sound, with the user's next step."""
     return Finding(check, FAILURE, printable(message), printable(step))
 
 

@@ -72,7 +72,7 @@ _PLAYBACK_CHECKS = ("player", "device", "sound server", "group", "cards", "sessi
 
 @frozen
 class SentenceResult:
-    """How the doctor's sentence ended."""
+    """How the doctor's test sentence ended."""
 
     state: State
     #: machine-readable reason why the goal ended, or "late" or "paused" if the doctor cancelled it
@@ -101,7 +101,7 @@ def speak_by_server(client: Client, text: str, limit: float) -> SentenceResult:
         try:
             if goal.speech_paused:
                 return SentenceResult(goal.cancel().state, "paused", "not spoken: speech is paused")
-            result = _goal_result(goal.wait(limit))
+            result = _convert_ended_goal(goal.wait(limit))
             with contextlib.suppress(TalkError):  # the result is valid even if the server ends now
                 result = replace(result, player=client.status().server.get("player"))
             return result
@@ -115,11 +115,11 @@ def speak_by_server(client: Client, text: str, limit: float) -> SentenceResult:
 
 
 def _cancel_late_goal(client: Client, goal: GoalHandle, limit: float) -> SentenceResult:
-    """Cancel a goal that took too long, and explain the delay."""
+    """Cancel a goal that took too long, and return a result that explains the delay."""
     before = client.status()
     ended = goal.cancel()
     if ended.state in {State.SUCCEEDED, State.ABORTED}:  # it ended before it could be cancelled
-        return _goal_result(ended)
+        return _convert_ended_goal(ended)
     pending = [each.id for each in before.pending]
     if before.server.get("paused") is True:
         return SentenceResult(ended.state, "paused", "not spoken: speech is paused")
@@ -132,16 +132,16 @@ def _cancel_late_goal(client: Client, goal: GoalHandle, limit: float) -> Sentenc
     return SentenceResult(ended.state, "late", f"not spoken: it was still waiting behind {goals} after {limit:g} s")
 
 
-def _goal_result(goal: Goal) -> SentenceResult:
+def _convert_ended_goal(goal: Goal) -> SentenceResult:
     """Convert an ended goal to a SentenceResult."""
     muted = goal.output.device if goal.output and goal.output.muted else None
     return SentenceResult(goal.state, goal.reason, goal.message, goal.duration, by_server=True, muted_device=muted)
 
 
 def speak_beside_server(client: Client, options: EngineOptions, limit: float) -> SentenceResult:
-    """Play a silent sentence with the doctor's own engine.
+    """Speak a silent sentence, and return its result and whether the server spoke meanwhile.
 
-    Return how it ended, and whether the server also spoke.
+    The doctor's own engine speaks the sentence.
     """
     try:
         before = client.status()
@@ -174,15 +174,15 @@ def speak_by_engine(text: str, options: EngineOptions, volume: float, limit: flo
         return SentenceResult(State.ABORTED, Reason.ENGINE_HUNG, f"the sentence did not end within {limit:g} s")
 
 
-def find_playback_step(findings: Sequence[Finding], *, custom: bool = False) -> str | None:
-    """Return advice for the most likely cause of a playback fault.
+def find_playback_step(findings: Sequence[Finding], *, custom_player: bool = False) -> str | None:
+    """Return advice for the most likely cause of a playback fault, or None.
 
     Args:
         findings: the findings of all checks before the sentence.
-        custom: whether the player is the user's own command. In that case, only the check of the player counts.
+        custom_player: whether the player is the user's own command. In that case, only the check of the player counts.
     """
     steps = {each.check: each.next for each in findings}
-    checks = _PLAYBACK_CHECKS[:1] if custom else _PLAYBACK_CHECKS
+    checks = _PLAYBACK_CHECKS[:1] if custom_player else _PLAYBACK_CHECKS
     return next((steps[each] for each in checks if steps.get(each) is not None), None)
 
 
@@ -217,16 +217,16 @@ def advise(
 
 
 def judge_sentence(
-    result: SentenceResult, *, silent: bool, device: object, playback_step: str | None = None, hangs: bool = False
+    result: SentenceResult, *, silent: bool, device: object, playback_step: str | None = None, sound_hangs: bool = False
 ) -> Finding:
-    """Return the finding about how the doctor's sentence ended.
+    """Return the finding about how the doctor's test sentence ended.
 
     Args:
         result: how the sentence ended.
         silent: whether it was played without sound.
         device: the device that was configured for the player, or None.
         playback_step: the result of `find_playback_step`.
-        hangs: whether the sound server hangs, which also blocks engines when they start.
+        sound_hangs: whether the sound server hangs, which also blocks engines when they start.
     """
     if result.state is State.SUCCEEDED and result.muted_device:
         step = ADVICE[Reason.MUTED].replace("@DEFAULT_SINK@", result.muted_device)
@@ -250,7 +250,7 @@ def judge_sentence(
         step = f"pactl suspend-sink {result.suspended[0]} 0"
     # The other checks give better advice, unless the player itself reported that its device is busy.
     elif playback_step is not None and step != _BUSY_STEP:
-        causes = {*_PLAYER_REASONS, Reason.NO_PLAYER, *(_START_REASONS if hangs else ())}
+        causes = {*_PLAYER_REASONS, Reason.NO_PLAYER, *(_START_REASONS if sound_hangs else ())}
         step = playback_step if result.reason in causes else step
     label = f"{result.state.name}, {result.reason}" if result.reason else result.state.name
     return failure(_SENTENCE_CHECK, f"{label}: {message}", step)

@@ -74,47 +74,45 @@ class SocketPlace:
 
     path: str
     #: one of the PLACE texts, or the system's error message
-    what: str
+    state: str
     #: owner of the process or the file, or None if unknown
     uid: int | None = None
     #: id of the listening process, or None if unknown
     pid: int | None = None
 
 
-def connect(option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Client | None, Finding]:
-    """Connect to the server.
-
-    Return the client, or None, and the finding about the server's socket.
+def connect(socket_option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Client | None, Finding]:
+    """Connect to the server, and return the client or None, and the finding about the socket.
 
     Args:
-        option: the value of --socket.
+        socket_option: the value of --socket.
         interrupt: descriptors that interrupt the wait.
     """
-    named = paths.named_socket(option)
-    named_by = "--socket" if option else "TALK_SOCKET" if named else None
+    named = paths.named_socket(socket_option)
+    named_by = "--socket" if socket_option else "TALK_SOCKET" if named else None
     tried = paths.client_sockets(named)
     # At these places, clients trust a server of any user.
-    trusted = {named, paths.SYSTEM_SOCKET}
+    trusted_paths = {named, paths.SYSTEM_SOCKET}
     try:
-        client = Client.over(SocketConnection(option, name=DOCTOR_NAME, interrupt=interrupt))
+        client = Client.over(SocketConnection(socket_option, name=DOCTOR_NAME, interrupt=interrupt))
     except TalkError as error:
-        return None, explain_missing_server([_probe_path(each, trusted) for each in tried], named_by, error)
-    before = [_probe_path(each, trusted) for each in tried[: tried.index(client.path)]]
+        return None, explain_missing_server([_probe_path(each, trusted_paths) for each in tried], named_by, error)
+    before = [_probe_path(each, trusted_paths) for each in tried[: tried.index(client.path)]]
     by = f"{named_by}, " if named_by else ""
     return client, judge_found_server(f"the server is on {client.path} ({by}process {client.server_pid})", before)
 
 
 def _find_refusal(error: TalkError, places: list[SocketPlace]) -> str | None:
-    """Find the line of an error message that says why the client was refused."""
+    """Return the line of an error message that says why the client was refused, or None."""
     lines = error.message.splitlines()
     if not lines[0].startswith(_NO_SERVER_PREFIX):
         return lines[0]
-    listening = [f"  {each.path}: " for each in places if each.what == PLACE_LISTENING]
+    listening = [f"  {each.path}: " for each in places if each.state == PLACE_LISTENING]
     return next((line.removeprefix(each) for line in lines for each in listening if line.startswith(each)), None)
 
 
-def _probe_path(path: str, trusted: Container[str | None]) -> SocketPlace:
-    """Examine a path by connecting to it."""
+def _probe_path(path: str, trusted_paths: Container[str | None]) -> SocketPlace:
+    """Connect to a socket path, and return what was found there."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
@@ -126,16 +124,16 @@ def _probe_path(path: str, trusted: Container[str | None]) -> SocketPlace:
                 return SocketPlace(path, PLACE_LISTENING, uid)
             return SocketPlace(path, paths.describe_place(path, error), uid)
         pid, uid = peers.credentials(probe)
-    if path not in trusted and uid not in {os.getuid(), 0}:
+    if path not in trusted_paths and uid not in {os.getuid(), 0}:
         return SocketPlace(path, PLACE_FOREIGN, uid, pid)
     stopped = peers.process_stat(pid)[:1] == [b"T"]  # for example after Ctrl-Z
     return SocketPlace(path, PLACE_STOPPED if stopped else PLACE_LISTENING, uid, pid)
 
 
 def request_status_and_log(client: Client) -> tuple[JsonObject, list[Goal]]:
-    """Return a server's status and its recently ended goals, oldest first.
+    """Return a server's status, after a short wait for its engine, and its recently ended goals.
 
-    If the server has just started, wait a moment until its engine has reported the player.
+    The engine of a server that has just started hasn't reported its player yet.
     """
     end = time.monotonic() + _ENGINE_START_LIMIT_S
     server, log = client.status().server, client.log(_LOG_GOALS_COUNT)
@@ -157,13 +155,13 @@ def local_pid(client: Client) -> int | None:
 
 
 def judge_found_server(message: str, earlier_places: list[SocketPlace]) -> Finding:
-    """Return the finding about the socket of the server that was found.
+    """Return the finding about a server's socket and the places that clients try before it.
 
     Args:
         message: the description of the server's socket.
         earlier_places: the places that clients try first.
     """
-    obstacles = [each for each in earlier_places if each.what != PLACE_ABSENT]
+    obstacles = [each for each in earlier_places if each.state != PLACE_ABSENT]
     if not obstacles:
         return ok("socket", message)
     message = f"{message}; clients first try {'; '.join(map(_format_place, obstacles))}"
@@ -181,26 +179,26 @@ def explain_missing_server(places: list[SocketPlace], named_by: str | None, erro
     tried = f"{named_by} names" if named_by else "tried:"
     words = f"no server found; {tried} {'; '.join(map(_format_place, places))}"
     message = _find_refusal(error, places)
-    if message is not None and not any(each.what == PLACE_STOPPED for each in places):
+    if message is not None and not any(each.state == PLACE_STOPPED for each in places):
         words = f"{words}; {message}"
     return failure("socket", words, _advise_on_missing_server(places, named_by, error.code))
 
 
 def _format_place(place: SocketPlace) -> str:
     """Describe a path and the result of examining it."""
-    whose = "" if place.uid is None or place.what not in {PLACE_FOREIGN, PLACE_FORBIDDEN} else f" (uid {place.uid})"
-    return f"{place.path}: {place.what}{whose}"
+    whose = "" if place.uid is None or place.state not in {PLACE_FOREIGN, PLACE_FORBIDDEN} else f" (uid {place.uid})"
+    return f"{place.path}: {place.state}{whose}"
 
 
-def _advise_on_missing_server(places: list[SocketPlace], named_by: str | None, code: str) -> str:
+def _advise_on_missing_server(places: list[SocketPlace], named_by: str | None, error_code: str) -> str:
     """Return advice for a user whose server wasn't found.
 
-    `code` is the code of the client's error.
+    `error_code` is the code of the client's error.
     """
     for each in paths.client_sockets(None) if named_by else []:
-        if _probe_path(each, set()).what == PLACE_LISTENING:
+        if _probe_path(each, set()).state == PLACE_LISTENING:
             return f"{_UNNAMING[named_by]}, because a server is running on {each}"
-    place = next((each for what in _PLACE_ADVICE for each in places if each.what == what), None)
+    place = next((each for state in _PLACE_ADVICE for each in places if each.state == state), None)
     if place is None:  # a new server could start at any of the places
         # Only root can see the sockets of all users.
         others = {*glob.glob(f"/run/user/*/talk/{paths.SOCKET_NAME}")}.difference(each.path for each in places)
@@ -210,14 +208,14 @@ def _advise_on_missing_server(places: list[SocketPlace], named_by: str | None, c
             return "talk serve"
         option = f" --socket {places[0].path}" if named_by == "--socket" else ""
         return f"{_UNNAMING[named_by]}, or start a server there: talk serve{option}"
-    if place.what == PLACE_LISTENING and code in _REFUSAL_ADVICE:
-        return _REFUSAL_ADVICE[code]
-    if named_by is not None and place.what == PLACE_DIRECTORY:
+    if place.state == PLACE_LISTENING and error_code in _REFUSAL_ADVICE:
+        return _REFUSAL_ADVICE[error_code]
+    if named_by is not None and place.state == PLACE_DIRECTORY:
         return f"name the socket in this directory: {_NAMING[named_by]}{place.path.rstrip('/')}/talk.sock"
-    if named_by is not None and place.what == PLACE_FILE:
+    if named_by is not None and place.state == PLACE_FILE:
         return f"{_UNNAMING[named_by]}, or name a socket instead of a file"
     whose = "its owner" if place.uid is None else f"uid {place.uid}"
-    return _PLACE_ADVICE[place.what].format(whose=whose, **fields(place))
+    return _PLACE_ADVICE[place.state].format(whose=whose, **fields(place))
 
 
 def judge_unresponsive_server(message: str) -> Finding:
@@ -233,7 +231,7 @@ def judge_server(server: JsonObject, log: Sequence[Goal], now: float) -> list[Fi
         log: the recently ended goals, oldest first.
         now: the current time in seconds since 1970.
     """
-    return [_judge_state(server), _judge_settings(server), _judge_recent(log, now, server)]
+    return [_judge_state(server), _judge_settings(server), _judge_recent_goals(log, now, server)]
 
 
 def _judge_state(server: JsonObject) -> Finding:
@@ -272,8 +270,8 @@ def _judge_settings(server: JsonObject) -> Finding:
     return ok("settings", words)
 
 
-def _judge_recent(goals: Sequence[Goal], now: float, server: JsonObject) -> Finding:
-    """Return the finding about recent goals.
+def _judge_recent_goals(goals: Sequence[Goal], now: float, server: JsonObject) -> Finding:
+    """Return the finding about failures of recent goals.
 
     It is a warning if no goal has succeeded since the last failure.
     """

@@ -106,7 +106,7 @@ class SoundServer:
     #: name such as "PulseAudio (on PipeWire 0.3.65)", or None if no sound server answers
     name: str | None = None
     #: name of the default sink, or None if unknown
-    sink: str | None = None
+    default_sink: str | None = None
     #: whether PulseAudio clients can connect. The player `pulse` is such a client.
     accepts_pulse: bool = True
     #: the existing sockets of sound servers, if no server answers
@@ -214,7 +214,7 @@ def find_cards(directory: str = _KERNEL_SOUND) -> tuple[str, ...]:
 
 
 def _may_open(stat: os.stat_result, acl: list[tuple[int, int, int]], session: UserSession) -> bool:
-    """Return whether the user may read and write a file.
+    """Return whether the user of the session may read and write a file.
 
     Args:
         stat: the file's mode and owner.
@@ -330,7 +330,7 @@ DEVICE_LISTS: dict[str, tuple[str, Callable[[ProgramOutput], Iterable[str]], str
 
 
 def add_pactl_hint(finding: Finding, env: Mapping[str, str]) -> Finding:
-    """Add a hint on how to install pactl if the advice needs it and it is missing."""
+    """Return the finding, with an installation hint if its advice needs pactl but there is none."""
     if finding.next is None or "pactl " not in finding.next or on_path("pactl", env):
         return finding
     return replace(finding, next=f"{finding.next} (to install pactl: sudo apt-get install -y {PACKAGES['pacat']})")
@@ -379,25 +379,25 @@ def _find_pulse_address(env: Mapping[str, str]) -> str | None:
     return None
 
 
-def check_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[str], *, is_used: bool) -> list[Finding]:
-    """Check the volume of the default sink or, without a sound server, of the sound cards.
+def check_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[str], *, in_use: bool) -> list[Finding]:
+    """Return findings about the volume of the sound server's output, or else of the sound cards.
 
     Args:
         env: the environment of the player.
         server: the sound server.
         cards: the names of the sound cards.
-        is_used: whether speech is known to go to these outputs.
+        in_use: whether speech is known to go to these outputs.
     """
-    levels = [judge_level(*each, is_used=is_used) for each in _read_levels(env, server, cards)]
+    levels = [judge_level(*each, in_use=in_use) for each in _read_levels(env, server, cards)]
     bad = [each for state in (FAILURE, WARNING) for each in levels if each.state == state]
     if bad or not levels:
         return bad[:1]
     return [ok(_LOUDNESS_CHECK, ", ".join(each.message for each in levels))]
 
 
-def _read_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[str]) -> Iterable[tuple[str, ...]]:
-    """Yield arguments of `judge_level` for each output."""
-    if server.name is not None:
+def _read_levels(env: Mapping[str, str], sound_server: SoundServer, cards: Sequence[str]) -> Iterable[tuple[str, ...]]:
+    """Yield the name, the level and the mixer commands of each output, for `judge_level`."""
+    if sound_server.name is not None:
         mute = run_program("pactl", "get-sink-mute", "@DEFAULT_SINK@", env=env)
         if mute.error is None:
             volume = run_program("pactl", "get-sink-volume", "@DEFAULT_SINK@", env=env)
@@ -406,7 +406,7 @@ def _read_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[st
         both = run_program("wpctl", "get-volume", "@DEFAULT_AUDIO_SINK@", env=env)
         if both.error is None:
             yield _DEFAULT_SINK, both.stdout, *_WPCTL_COMMANDS
-    elif cards and not server.hangs:
+    elif cards and not sound_server.hangs:
         found = re.findall(r"control '([^']*)'", run_program("amixer", "scontrols", env=env).stdout)
         for each in filter(found.__contains__, _ALSA_CONTROLS):
             output = run_program("amixer", "sget", each, env=env)
@@ -414,25 +414,25 @@ def _read_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[st
                 yield each, output.stdout, f"amixer sset {each} unmute", f"amixer sset {each} 70%"
 
 
-def judge_level(name: str, text: str, unmute_command: str, louder_command: str, *, is_used: bool) -> Finding:
+def judge_level(name: str, mixer_output: str, unmute_command: str, louder_command: str, *, in_use: bool) -> Finding:
     """Return the finding about the volume of one output.
 
     If its channels differ, the loudest one counts.
 
     Args:
         name: the name of the sink or the mixer control.
-        text: the output of a mixer program: "Mute: no" and "40%" by pactl, "Volume: 0.40 [MUTED]" by wpctl, or
+        mixer_output: the output of a mixer program: "Mute: no" and "40%" by pactl, "Volume: 0.40 [MUTED]" by wpctl, or
             "[40%] [on]" for each channel by amixer.
         unmute_command: the command that unmutes the output.
         louder_command: the command that makes the output louder.
-        is_used: whether speech is known to go to this output.
+        in_use: whether speech is known to go to this output.
     """
-    broken = failure if is_used else warning
-    switches = re.findall(r"\[(on|off)\]", text)
-    if "Mute: yes" in text or "[MUTED]" in text or (switches and "on" not in switches):
+    broken = failure if in_use else warning
+    switches = re.findall(r"\[(on|off)\]", mixer_output)
+    if "Mute: yes" in mixer_output or "[MUTED]" in mixer_output or (switches and "on" not in switches):
         return broken(_LOUDNESS_CHECK, f"{name} is muted", unmute_command)
-    percents = [int(each) for each in re.findall(r"(\d+)%", text)]
-    percents += [round(float(each) * 100) for each in re.findall(r"Volume: (\d+(?:\.\d+)?)", text)]
+    percents = [int(each) for each in re.findall(r"(\d+)%", mixer_output)]
+    percents += [round(float(each) * 100) for each in re.findall(r"Volume: (\d+(?:\.\d+)?)", mixer_output)]
     if not percents:
         return ok(_LOUDNESS_CHECK, f"{name} is not muted")
     percent = max(percents)
@@ -471,19 +471,19 @@ def judge_session(session: UserSession) -> Finding:
     return ok("session", words)
 
 
-def judge_silent_player(player: str | None, *, by_server: bool) -> Finding:
+def judge_silent_player(player: str | None, *, set_by_server: bool) -> Finding:
     """Return the finding about a configured player that makes no sound."""
-    step = "restart the server without --player" if by_server else "unset TALK_PLAYER"
-    return failure("player", f"{player} ({_describe_player_setting(by_server)}) makes no sound", step)
+    step = "restart the server without --player" if set_by_server else "unset TALK_PLAYER"
+    return failure("player", f"{player} ({_describe_player_setting(set_by_server)}) makes no sound", step)
 
 
-def _describe_player_setting(by_server: bool) -> str:
+def _describe_player_setting(set_by_server: bool) -> str:
     """Describe where the player was configured."""
-    return "set by the server" if by_server else "set by TALK_PLAYER"
+    return "set by the server" if set_by_server else "set by TALK_PLAYER"
 
 
 def check_player(env: Mapping[str, str], configured: str | None, used: str | None, *, by_server: bool) -> Finding:
-    """Check whether the player is installed.
+    """Check whether the player is installed, and return the finding.
 
     Args:
         env: the environment of the player.
@@ -512,7 +512,7 @@ def check_player(env: Mapping[str, str], configured: str | None, used: str | Non
 
 
 def check_device(env: Mapping[str, str], player: str, configured: str | None) -> Finding:
-    """Check whether the configured device is one of the player's devices.
+    """Check whether the player has the configured device, and return the finding.
 
     Args:
         env: the environment of the player.
@@ -542,11 +542,11 @@ def check_device(env: Mapping[str, str], player: str, configured: str | None) ->
     return warning("device", words, "restart the server with --device and one of these names")
 
 
-def check_cards(cards: Sequence[str], server: SoundServer, session: UserSession) -> Finding:
-    """Check whether the kernel has found any sound cards."""
+def check_cards(cards: Sequence[str], sound_server: SoundServer, session: UserSession) -> Finding:
+    """Return the finding about whether the kernel has found any sound cards."""
     if cards:
         return ok("cards", join_names(cards))
-    if server.name is not None:
+    if sound_server.name is not None:
         return ok("cards", "this machine has no sound card, but the sound server has an output")
     if _CONTAINER in session.origins:
         step = "start the container with --device /dev/snd, or with the sound server's socket (see the README)"
@@ -556,8 +556,8 @@ def check_cards(cards: Sequence[str], server: SoundServer, session: UserSession)
     return warning("cards", words, "connect a loudspeaker or a sound card, and check with: aplay -l")
 
 
-def check_access(server: SoundServer, session: UserSession, directory: str = "/dev/snd") -> Finding:
-    """Check whether the user may open the sound cards."""
+def check_access(sound_server: SoundServer, session: UserSession, directory: str = "/dev/snd") -> Finding:
+    """Check whether the user may open the sound cards, and return the finding."""
     nodes, group, forbidden = players.playback_devices(directory), _AUDIO_GROUP, []
     for each in nodes:
         with contextlib.suppress(OSError):
@@ -572,7 +572,7 @@ def check_access(server: SoundServer, session: UserSession, directory: str = "/d
         member = f"in the group {group}" if is_member else f"not in the group {group}, which is not needed"
         return ok("group", f"user {session.user} may open the cards ({member})")
     words = f"user {session.user} may not open {join_names(forbidden)}, and is not in the group {group}"
-    if server.name is not None:
+    if sound_server.name is not None:
         return ok("group", f"{words}; the sound server opens the cards")
     with contextlib.suppress(KeyError):
         if session.user in grp.getgrnam(group).gr_mem:
@@ -585,11 +585,11 @@ def judge_sound_server(server: SoundServer, cards: Sequence[str], session: UserS
     """Return the finding about the sound server."""
     check = _SOUND_SERVER_CHECK
     where = "from here" if session.server_pid is None else f"from the server (process {session.server_pid})"
-    if server.name is not None and server.sink == DUMMY_SINK:
+    if server.name is not None and server.default_sink == DUMMY_SINK:
         step = "connect a loudspeaker, and check that it is listed: pactl list short sinks"
         return warning(check, f"{server.name} has only the dummy output {DUMMY_SINK}, which nobody can hear", step)
     if server.name is not None:
-        return ok(check, server.name + (f", plays to {server.sink}" if server.sink else ""))
+        return ok(check, server.name + (f", plays to {server.default_sink}" if server.default_sink else ""))
     if server.hangs:
         step = "restart the sound server: systemctl --user restart pipewire pipewire-pulse (or: pulseaudio -k)"
         return warning(check, f"a sound server is running, but does not answer {where}", step)
@@ -606,7 +606,7 @@ def judge_sound_server(server: SoundServer, cards: Sequence[str], session: UserS
 
 
 def _judge_unreachable(server: SoundServer, session: UserSession, message: str) -> Finding:
-    """Return a warning that the sound server can't be reached."""
+    """Return a warning that the sound server can't be reached, with advice."""
     hint, step = "", "systemctl --user restart pipewire pipewire-pulse (or: pulseaudio --start)"
     if server.pulse_server is not None:
         step = "unset PULSE_SERVER, or start the sound server that it names"

@@ -39,7 +39,7 @@ WORKING_STATES = ("ready", "starting")
 #: The commands to show if a package is missing.
 INSTALL_LIBRARY = install.espeak_library()
 _INSTALL_PYTTSX3 = install.command("pyttsx3")
-_INSTALL_NEURAL = install.neural()
+_INSTALL_NEURAL = install.neural_command()
 
 #: Advice if libespeak-ng can't be used. The key is a part of the engine's message, or the reason for the failure.
 _LIBRARY_ADVICE = {
@@ -63,7 +63,7 @@ _IMPORT_TIMED_OUT = f"it takes more than {_IMPORT_LIMIT_S:g} s"
 _IMPORT_ADVICE = {
     _IMPORT_TIMED_OUT: "run talk doctor again when this machine is less busy",
     "SIGILL": "this processor is too old for that version: install an older version, or use an espeak voice",
-    "": f"install it again: {install.neural(reinstall=True)}",
+    "": f"install it again: {install.neural_command(reinstall=True)}",
 }
 _CHOOSE_ESPEAK = "choose an espeak voice: talk set --voice en, or talk serve --voice en"
 
@@ -112,24 +112,24 @@ class VoiceTrial:
 
 
 def installed_version(package: str) -> str | None:
-    """Return the version of a package without importing it."""
+    """Return the version of a package without importing it, or None if it isn't installed."""
     with contextlib.suppress(PackageNotFoundError):
         return version(package)
     return None
 
 
-def start_engine(options: EngineOptions, limit: float = math.inf, output: int | None = None) -> PrivateEngine:
-    """Start an engine process.
+def start_engine(options: EngineOptions, limit: float = math.inf, wav_fd: int | None = None) -> PrivateEngine:
+    """Start an engine process, and return the object that controls it.
 
     Args:
         options: the options of the engine.
         limit: seconds after which waiting for the process raises TimeoutError.
-        output: descriptor to which the sound is written as a WAV file instead of being played. The engine then lists no
+        wav_fd: descriptor to which the sound is written as a WAV file instead of being played. The engine then lists no
             voices.
     """
     given = options.driver, options.player, options.device, options.voice
     configure = protocol.Configure(
-        os.getpid(), *given, list_voices=output is None, output_fd=output, last_player=options.first_player
+        os.getpid(), *given, list_voices=wav_fd is None, output_fd=wav_fd, last_player=options.first_player
     )
     deadline = time.monotonic() + limit
     return PrivateEngine(configure, env=options.env, deadline=deadline, interrupt=options.interrupt)
@@ -164,30 +164,30 @@ def judge_python() -> Finding:
     return ok("python", f"Python {platform.python_version()} ({sys.executable})")
 
 
-def judge_engine(installed: str | None, engine: EngineReport, *, server: str | None) -> list[Finding]:
+def judge_engine(pyttsx3_version: str | None, report: EngineReport, *, server_engine: str | None) -> list[Finding]:
     """Return the findings about pyttsx3, libespeak-ng and the voices.
 
     Args:
-        installed: version of pyttsx3, or None if it is not installed.
-        engine: the report of the doctor's engine process.
-        server: the state of the server's engine, or None if there is no server. If that engine works, faults of the
-            doctor's own engine are only warnings.
+        pyttsx3_version: version of pyttsx3, or None if it is not installed.
+        report: the report of the doctor's engine process.
+        server_engine: the state of the server's engine, or None if there is no server. If that engine works, faults
+            of the doctor's own engine are only warnings.
     """
-    broken = warning if server in WORKING_STATES else failure
-    if engine.ready is not None and server not in {None, *WORKING_STATES}:
-        engine = EngineReport(reason=Reason.ENGINE_FAILED, message=f"the server's engine: {server}")
-    if engine.ready is not None:
-        words = f"{installed or 'unknown version'}, driver {engine.ready.driver}"
-        return [ok("pyttsx3", words), *_judge_library(engine.ready.version, engine.voices)]
-    message = engine.message.partition("; install it with: ")[0]  # the finding shows the advice separately
-    if "pyttsx3 is missing" in message or installed is None:
+    broken = warning if server_engine in WORKING_STATES else failure
+    if report.ready is not None and server_engine not in {None, *WORKING_STATES}:
+        report = EngineReport(reason=Reason.ENGINE_FAILED, message=f"the server's engine: {server_engine}")
+    if report.ready is not None:
+        words = f"{pyttsx3_version or 'unknown version'}, driver {report.ready.driver}"
+        return [ok("pyttsx3", words), *_judge_library(report.ready.version, report.voices)]
+    message = report.message.partition("; install it with: ")[0]  # the finding shows the advice separately
+    if "pyttsx3 is missing" in message or pyttsx3_version is None:
         return [broken("pyttsx3", message or "pyttsx3 is missing", _INSTALL_PYTTSX3)]
-    found = ok("pyttsx3", installed)
-    if engine.reason == Reason.UNKNOWN_VOICE:
+    found = ok("pyttsx3", pyttsx3_version)
+    if report.reason == Reason.UNKNOWN_VOICE:
         step = "set TALK_VOICE or --voice to a voice that 'talk voices' lists"
-        step = _INSTALL_NEURAL if _INSTALL_NEURAL in engine.message else step
+        step = _INSTALL_NEURAL if _INSTALL_NEURAL in report.message else step
         return [found, ok("libespeak-ng", "loaded"), broken("voices", message, step)]
-    clue = next((each for each in _LIBRARY_ADVICE if each in message or each == engine.reason), "")
+    clue = next((each for each in _LIBRARY_ADVICE if each in message or each == report.reason), "")
     if clue == Reason.ENGINE_CRASHED:
         message = f"the engine process crashed while it loaded the library: {message}"
     step = _LIBRARY_ADVICE.get(clue, "read the engine's error messages in the log of talk serve")
@@ -206,30 +206,30 @@ def _judge_library(library_version: str | None, voices: tuple[str, ...] | None) 
 
 
 def check_neural(
-    used: str | None, options: EngineOptions, limit: float, server_voices: dict[str, Any] | None
+    used_voice: str | None, options: EngineOptions, limit: float, server_voices: dict[str, Any] | None
 ) -> Iterator[Finding]:
-    """Check the installation of neural voices, and try the voice in use.
+    """Check the packages and files of neural voices, try the voice in use, and yield findings.
 
     Args:
-        used: the voice in use, as the user wrote it, or None if no neural voice is in use.
+        used_voice: the voice in use, as the user wrote it, or None if no neural voice is in use.
         options: options for the engine process.
         limit: time limit for trying the voice, in seconds.
         server_voices: the server's description of its neural voices, or None if there is no server. A server speaks
             with espeak if a neural voice fails.
     """
-    broken = failure if used is not None and server_voices is None else warning
+    broken = failure if used_voice is not None and server_voices is None else warning
     fault = _find_package_fault(os.environ if options.env is None else options.env)
     if fault is None:
         yield ok(_PACKAGES_CHECK, ", ".join(map(_with_version, install.NEURAL_PACKAGES)))
     else:
         yield broken(_PACKAGES_CHECK, *fault)
     yield from _check_voice_files(options.env)
-    if used is not None and fault is None:
-        yield judge_trial(used, _try_voice(used, options, limit), server_voices)
+    if used_voice is not None and fault is None:
+        yield judge_trial(used_voice, _try_voice(used_voice, options, limit), server_voices)
 
 
 def _check_voice_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
-    """Check the files of all installed neural voices."""
+    """Check the files of all installed neural voices, and yield a finding."""
     valid, invalid = [], []
     for name, path in models.find_models(env).items():
         try:
@@ -249,10 +249,7 @@ def _check_voice_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
 
 
 def _find_package_fault(env: Mapping[str, str]) -> tuple[str, str] | None:
-    """Test the packages of neural voices.
-
-    Return an error message and advice, or None if they can be imported.
-    """
+    """Return why a package of neural voices can't be imported, and advice; None if all can."""
     missing = models.missing_package()
     if missing is not None:
         return _split_advice(missing)
@@ -283,10 +280,7 @@ def _split_advice(message: str) -> tuple[str, str]:
 
 
 def _try_voice(voice: str, options: EngineOptions, limit: float) -> VoiceTrial:
-    """Load a voice, and measure how fast it speaks.
-
-    Nothing is played.
-    """
+    """Load a voice, measure how fast it speaks without playing anything, and return the result."""
     try:
         with open(os.devnull, "wb") as output, start_engine(options, limit, output.fileno()) as engine:
             engine.wait_for(protocol.Ready)
@@ -305,10 +299,7 @@ def _try_voice(voice: str, options: EngineOptions, limit: float) -> VoiceTrial:
 
 
 def _speak(engine: PrivateEngine, voice: str, text: str) -> tuple[protocol.Ended, float | None]:
-    """Speak a text, and return how it ended.
-
-    Also return the voice's loading time, or None if it was already loaded.
-    """
+    """Speak a text, and return how it ended and the voice's loading time, if it was loaded."""
     load_s = None
     # Set `voice_only`, because otherwise espeak would speak if the voice isn't loaded.
     engine.speak(protocol.Speak(text, text, SENTENCE_RATE_WPM, 1.0, voice, 50, voice_only=True))
@@ -321,7 +312,7 @@ def _speak(engine: PrivateEngine, voice: str, text: str) -> tuple[protocol.Ended
 
 
 def _memory_of(pid: int) -> int | None:
-    """Return the resident memory of a process in bytes."""
+    """Return the resident memory of a process in bytes, or None if it is unknown."""
     statm = read_proc_file(f"/proc/{pid}/statm")  # the second number is the count of resident pages
     return int(statm.split()[1]) * os.sysconf("SC_PAGE_SIZE") if statm else None
 
@@ -338,13 +329,13 @@ def judge_server_voices(voices: dict[str, Any]) -> list[Finding]:
     return [ok(_NEURAL_CHECK, f"the server's neural voices: {join_names(list(voices))}")] if voices else []
 
 
-def judge_trial(used: str, trial: VoiceTrial, server_voices: dict[str, Any] | None) -> Finding:
+def judge_trial(voice: str, trial: VoiceTrial, server_voices: dict[str, Any] | None) -> Finding:
     """Return the finding about the trial of a neural voice.
 
     The other arguments are those of `check_neural`.
     """
     broken = failure if server_voices is None else warning
-    words = f"{used} is in use: "
+    words = f"{voice} is in use: "
     if trial.speed is None:
         message, step = trial.fault
         return broken(_NEURAL_CHECK, words + message, step)

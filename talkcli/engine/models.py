@@ -81,7 +81,7 @@ def missing_package() -> str | None:
 
     missing = next((each for each in install.NEURAL_PACKAGES if find_spec(each) is None), None)
     how = "install it with: " * install.IS_64_BIT
-    return None if missing is None else f"{missing} is missing; {how}{install.neural()}"
+    return None if missing is None else f"{missing} is missing; {how}{install.neural_command()}"
 
 
 def find_models(environment: Mapping[str, str] | None = None) -> dict[str, str]:

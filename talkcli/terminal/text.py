@@ -69,19 +69,20 @@ class Screen:
     boot: str = ""
 
     def columns_left(self, taken: int) -> int | None:
-        """Return how many columns remain if `taken` columns are used."""
+        """Return how many columns remain if `taken` are used, or None if lines have no limit."""
         return None if self.width is None else max(self.width, MIN_COLUMNS) - taken
 
-    def fit_name(self, name: str, room: int = _MIN_NAME_COLUMNS, share: int = 4) -> str:
-        """Escape a name or an id, and cut it to leave room for other columns.
+    def fit_name(self, name: str, min_columns: int = _MIN_NAME_COLUMNS, width_divisor: int = 4) -> str:
+        """Escape a name, and cut it to a fraction of the line, but not below `min_columns`.
 
         Args:
             name: the name or the id.
-            room: its maximum width on a narrow terminal.
-            share: the divisor for its maximum width on a wide terminal. For example, 4 allows a quarter of the line.
+            min_columns: its maximum width on a narrow terminal.
+            width_divisor: the divisor for its maximum width on a wide terminal. For example, 4 allows a quarter of the
+                line.
         """
         columns = self.columns_left(0)
-        return cut(printable(name), None if columns is None else max(room, columns // share))
+        return cut(printable(name), None if columns is None else max(min_columns, columns // width_divisor))
 
     def goal_id(self, goal_id: str) -> str:
         """Return a goal's id for display, such as `12` for a goal of the running server."""
@@ -126,7 +127,7 @@ def width(text: str) -> int:
 
 
 def cut(text: str, columns: int | None) -> str:
-    """Cut a text that is too long, and add an ellipsis.
+    """Cut a text to a number of columns, and mark the cut with an ellipsis.
 
     The text must not contain colour codes.
     """
@@ -136,8 +137,8 @@ def cut(text: str, columns: int | None) -> str:
     return f"{text[:kept]}{ELLIPSIS}" if columns > 0 else ""
 
 
-def shorten(text: str, columns: int | None) -> str:
-    """Cut a text that is too long, but keep its closing quote."""
+def cut_quoted(text: str, columns: int | None) -> str:
+    """Cut a text to a number of columns, but keep its closing quote."""
     if columns is None or not (len(text) > 1 and text[0] == text[-1] == '"'):
         return cut(text, columns)
     return f'"{cut(text[1:-1], columns - 2)}"'
@@ -157,21 +158,21 @@ def longest_fitting(forms: Sequence[str], columns: int | None) -> str:
 
 
 def room_beside(text: str, columns: int, screen: Screen) -> int:
-    """Return how many columns the details beside a text may take.
+    """Return how many of `columns` the details beside a text may take.
 
     They leave at least half of the line to the text, or 16 columns if whole ids are shown.
     """
     return columns - len(COLUMN_GAP) - min(width(text), _MIN_TEXT_COLUMNS if screen.long else columns // 2)
 
 
-def fit_row(head: str, text: str, details: Sequence[str], text_columns: int, screen: Screen) -> str:
-    """Format a row of a table so that it fits the screen.
+def fit_row(head: str, text: str, details: Sequence[str], text_width: int, screen: Screen) -> str:
+    """Format a table row with a head, a text and the longest of the details that fits.
 
     Args:
         head: the columns before the text.
         text: the text.
         details: possible texts for the column after it, longest first.
-        text_columns: the usual width of the text column. A longer text moves the details to the right.
+        text_width: the usual width of the text column. A longer text moves the details to the right.
         screen: the properties of the output.
     """
     columns = screen.columns_left(width(head))
@@ -179,12 +180,12 @@ def fit_row(head: str, text: str, details: Sequence[str], text_columns: int, scr
     if columns is not None:
         shown = longest_fitting(details, room_beside(text, columns, screen))
         columns -= len(COLUMN_GAP) + width(shown) if shown else 0
-        text, text_columns = shorten(text, columns), min(text_columns, columns)
-    return (head + pad(text, text_columns) + COLUMN_GAP + shown).rstrip()
+        text, text_width = cut_quoted(text, columns), min(text_width, columns)
+    return (head + pad(text, text_width) + COLUMN_GAP + shown).rstrip()
 
 
 def wrap(pieces: Sequence[str], head: str, screen: Screen) -> list[str]:
-    """Join pieces of text, and wrap them to fit the screen.
+    """Join a head and pieces of text, and wrap them into lines that fit the screen.
 
     `head` starts the first line. The other lines are indented by its width. Lines are only broken between pieces.
     """
@@ -258,13 +259,13 @@ class MeasuredText:
         """Return the characters from `start` to `end`, with invisible ones escaped."""
         return "".join(self._shown[start:end])
 
-    def _first_shown(self, column: int, last: int) -> int:
-        """Return the index of the first character to show after an ellipsis."""
+    def _first_shown(self, column: int, max_index: int) -> int:
+        """Return the index, at most `max_index`, of the first character right of `column`."""
         if column <= 0:
             return 0
         # The ellipsis needs one more column. The first visible character must not be a combining mark.
-        begins = (place for place in range(last) if column < self._columns[place] < self._columns[place + 1])
-        return next(begins, last)
+        begins = (place for place in range(max_index) if column < self._columns[place] < self._columns[place + 1])
+        return next(begins, max_index)
 
     def _count_fitting(self, columns: int) -> int:
         """Return how many characters at the start of the text fit into `columns`."""

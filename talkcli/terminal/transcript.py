@@ -18,12 +18,12 @@ from talkcli.terminal.text import (
     TEXT_COLUMNS,
     Screen,
     cut,
+    cut_quoted,
     fit_row,
     longest_fitting,
     pad,
     printable,
     room_beside,
-    shorten,
     width,
 )
 
@@ -126,10 +126,7 @@ class Transcript:
         return []  # results aren't shown
 
     def _format_word(self, event: WordHeard, screen: Screen, now: float) -> list[str]:
-        """Record that a word was heard.
-
-        Return the line that shows the word, if words are shown.
-        """
+        """Record that a word was heard, and return a line with the word, if words are shown."""
         self._heard.add(event.id)
         word = f"{printable(event.word)}{COLUMN_GAP}{event.time:.2f} s"
         return [self._head_columns(event.at or now, "word", None, event.id, screen) + word] * self._with_words
@@ -184,8 +181,8 @@ class Transcript:
         if goal is not None and goal.text is not None:
             text = goal.text[: event.start] + event.text if isinstance(event, TextAdded) else goal.text
             # The sentences that were complete at the beginning have been shown with the goal.
-            shown = self._shown_chars.get(event.id, _complete_chars(goal.text, 0))
-            end = len(text) if waits else _complete_chars(text, shown)
+            shown = self._shown_chars.get(event.id, _last_sentence_end(goal.text, 0))
+            end = len(text) if waits else _last_sentence_end(text, shown)
             if added := text[shown:end].strip():
                 head = self._head_columns(at, "text", None, event.id, screen)
                 lines.append(fit_row(head, quoted_text(replace(goal, text=added, more=False)), [""], 0, screen))
@@ -204,12 +201,9 @@ class Transcript:
         forms = [f"by {each}" for each in sender_forms(by, screen)] if by else [""]
         return (head + longest_fitting(forms, screen.columns_left(width(head)))).rstrip()
 
-    def _format_goal(self, goal: Goal, state: State, at: float, screen: Screen) -> list[str]:
-        """Return the lines that show a goal.
-
-        `at` is a timestamp.
-        """
-        head = self._head_columns(at, state.name, state, goal.id, screen)
+    def _format_goal(self, goal: Goal, state: State, timestamp: float, screen: Screen) -> list[str]:
+        """Return the lines that show a goal with this state and timestamp."""
+        head = self._head_columns(timestamp, state.name, state, goal.id, screen)
         ended = state.terminal
         forms = reason_forms(goal, screen) if ended else sender_forms(goal.client, screen)
         if state is State.REJECTED:  # no earlier line has shown the goal's sender
@@ -222,18 +216,18 @@ class Transcript:
         if ended and all(width(each) > room_beside(text, columns, screen) for each in forms):
             # The reason doesn't fit beside the text, so it gets a line of its own.
             below = longest_fitting(forms, screen.columns_left(_INDENT_COLUMNS))
-            return [head + shorten(text, columns), " " * _INDENT_COLUMNS + below]
+            return [head + cut_quoted(text, columns), " " * _INDENT_COLUMNS + below]
         return [fit_row(head, text, forms, columns * 3 // 4, screen)]
 
-    def _head_columns(self, at: float, word: str, state: State | None, goal_id: str, screen: Screen) -> str:
-        """Return the first columns of a line, up to the goal's id."""
+    def _head_columns(self, timestamp: float, label: str, state: State | None, goal_id: str, screen: Screen) -> str:
+        """Return a line's columns up to the goal's id, with the label in the state's colour."""
         robot = [] if self._robot is None else [self._widths.pad_robot(self._robot, screen)]
-        cells = (screen.coloured(pad(word, 10), state), self._widths.pad_goal_id(goal_id, screen))
-        return COLUMN_GAP.join((clock_time(at), *robot, *cells, ""))
+        cells = (screen.coloured(pad(label, 10), state), self._widths.pad_goal_id(goal_id, screen))
+        return COLUMN_GAP.join((clock_time(timestamp), *robot, *cells, ""))
 
 
-def _complete_chars(text: str, start: int) -> int:
-    """Return the offset after the last complete sentence.
+def _last_sentence_end(text: str, start: int) -> int:
+    """Return the offset after the last complete sentence, or `start` if there is none.
 
     The search begins at the offset `start`.
     """
@@ -255,7 +249,7 @@ def log_lines(goals: Sequence[Goal], screen: Screen, now: float) -> list[str]:
     columns = screen.columns_left(width(heads[0]))
     # A sender that has chosen a long name must not leave too little room for the texts.
     max_columns = None if columns is None or screen.long else columns // 4
-    senders = [[shorten(each, max_columns) for each in sender_forms(goal.client, screen)] for goal in goals]
+    senders = [[cut_quoted(each, max_columns) for each in sender_forms(goal.client, screen)] for goal in goals]
     sender_columns = min(TEXT_COLUMNS, max(width(forms[-1]) for forms in senders))
     texts = [quoted_text(goal) for goal in goals]
     left = TEXT_COLUMNS if columns is None else columns - len(COLUMN_GAP) - sender_columns

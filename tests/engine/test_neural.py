@@ -206,12 +206,12 @@ def test_the_error_without_the_extra_contains_the_install_command(tmp_path: Path
     with _engine(tmp_path / "voices", before=before) as engine:
         message = _failure_message(engine.spoken(TEXT, voice=VOICE), "unknown_voice")
         assert f"{VOICE} cannot be loaded" in message
-        assert install.neural() in message
+        assert install.neural_command() in message
         assert engine.spoken("yes", "g2").outcome == protocol.OUTCOME_COMPLETED
     with _engine(tmp_path / "voices", before=before, voice=VOICE) as engine:
         failed = engine.until(protocol.StartFailed)
         assert failed.usage_error
-        assert install.neural() in failed.message
+        assert install.neural_command() in failed.message
 
 
 # -- faults
@@ -327,7 +327,7 @@ def test_a_sentence_ends_once_with_little_memory_and_espeak_speaks_next(tmp_path
             assert megabytes > 300, "the voice spoke with too little memory"
         else:
             message = _failure_message(ended)
-            assert "there is not enough memory; end another program" in message or install.neural() in message
+            assert "there is not enough memory; end another program" in message or install.neural_command() in message
         assert engine.spoken(TEXT, "g2").outcome == protocol.OUTCOME_COMPLETED
 
 

@@ -77,8 +77,8 @@ def test_the_next_step_for_a_missing_device_comes_from_the_device_checks() -> No
 def test_a_custom_player_is_to_be_tested_by_hand_unless_the_cause_is_known() -> None:
     cards = warning("cards", "none in this container", "start the container with --device /dev/snd")
     missing = warning("player", "it is not there", "name a program that is there")
-    assert find_playback_step([cards], custom=True) is None
-    assert find_playback_step([cards, missing], custom=True) == "name a program that is there"
+    assert find_playback_step([cards], custom_player=True) is None
+    assert find_playback_step([cards, missing], custom_player=True) == "name a program that is there"
     stalled = ("audio_stalled", "it accepted no sound for 5 s")
     by_hand = "test the player with a second of silence: head -c 44100 /dev/zero | sox -r 22050 -d usb"
     assert step_after(*stalled, "sox -r {rate} -d {device}") == by_hand
@@ -218,29 +218,29 @@ def test_control_characters_are_escaped_in_every_finding() -> None:
 )
 def test_an_engine_failure_is_reported_by_the_right_check(reason: str, message: str, check: str, step: str) -> None:
     engine = EngineReport(reason=reason, message=message)
-    finding = find(voice.judge_engine("2.99", engine, server=None), check)
+    finding = find(voice.judge_engine("2.99", engine, server_engine=None), check)
     assert finding.state == FAILURE
     assert message in finding.message
     assert step in (finding.next or "")
-    beside_server = voice.judge_engine("2.99", engine, server="ready")
+    beside_server = voice.judge_engine("2.99", engine, server_engine="ready")
     assert find(beside_server, check).state == WARNING, "the server has its own engine"
 
 
 def test_a_working_engine_is_reported_with_its_version_and_voices() -> None:
-    findings = voice.judge_engine("2.99", ENGINE, server=None)
+    findings = voice.judge_engine("2.99", ENGINE, server_engine=None)
     assert [finding.check for finding in findings] == ["pyttsx3", "libespeak-ng", "voices"]
     assert {finding.state for finding in findings} == {OK}
     assert "1.51 (system)" in findings[1].message
     assert "141" in findings[2].message
     for voices in (None, ()):
         engine = EngineReport(READY, voices)
-        assert voice.judge_engine("2.99", engine, server="starting")[-1].state == WARNING
+        assert voice.judge_engine("2.99", engine, server_engine="starting")[-1].state == WARNING
 
 
 def test_a_missing_library_is_fixed_before_a_silent_player() -> None:
     for engine in (ENGINE, EngineReport(reason="engine_failed", message=MISSING)):
-        judged = voice.judge_engine("2.99", engine, server=MISSING)
-        assert next_step([*judged, sound.judge_silent_player("null", by_server=True)]) == voice.INSTALL_LIBRARY
+        judged = voice.judge_engine("2.99", engine, server_engine=MISSING)
+        assert next_step([*judged, sound.judge_silent_player("null", set_by_server=True)]) == voice.INSTALL_LIBRARY
 
 
 PATH = "/run/user/1000/talk/talk.sock"
@@ -408,7 +408,7 @@ PI = UserSession(1000, "pi", gids=(1000, 29), runtime_dir="/run/user/1000", runt
 CARDS = ("USB Audio Device",)
 NO_SERVER = SoundServer(error="Connection refused")
 WIRE = SoundServer("PipeWire without PulseAudio support", accepts_pulse=False)
-PULSE = SoundServer(name="PulseAudio (on PipeWire 1.2.7)", sink="alsa_output.usb")
+PULSE = SoundServer(name="PulseAudio (on PipeWire 1.2.7)", default_sink="alsa_output.usb")
 
 
 def judged_server(server: SoundServer, cards: tuple[str, ...] = CARDS, session: UserSession = PI) -> Finding:
@@ -462,7 +462,7 @@ def test_the_engine_process_or_else_the_sound_server_determines_the_player(
 
 
 def test_a_sound_server_with_only_a_dummy_output_is_a_warning() -> None:
-    finding = judged_server(replace(PULSE, sink=DUMMY_SINK))
+    finding = judged_server(replace(PULSE, default_sink=DUMMY_SINK))
     assert (finding.state, finding.next) == (
         WARNING, "connect a loudspeaker, and check that it is listed: pactl list short sinks"
     )  # fmt: skip
@@ -488,7 +488,7 @@ def test_a_silent_player_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
         examination._env = {"PATH": "/nowhere"}
         (finding,) = examination._check_sound()
         assert (finding.check, finding.state, finding.next) == ("player", FAILURE, "unset TALK_PLAYER")
-        assert "without --player" in str(sound.judge_silent_player(player, by_server=True).next)
+        assert "without --player" in str(sound.judge_silent_player(player, set_by_server=True).next)
 
 
 def test_a_step_that_needs_pactl_names_its_package(tmp_path: Path) -> None:
@@ -561,10 +561,10 @@ SOUND_OUTPUTS = [
 
 @pytest.mark.parametrize(("text", "state", "message"), SOUND_OUTPUTS)
 def test_a_muted_or_quiet_output_is_reported(text: str, state: str, message: str) -> None:
-    finding = sound.judge_level("out", text, "unmute", "louder", is_used=True)
+    finding = sound.judge_level("out", text, "unmute", "louder", in_use=True)
     assert (finding.check, finding.state, finding.message) == ("loudness", state, message)
     assert finding.next == (None if state == OK else "unmute" if message == "out is muted" else "louder")
-    finding = sound.judge_level("out", text, "unmute", "louder", is_used=False)
+    finding = sound.judge_level("out", text, "unmute", "louder", in_use=False)
     assert finding.state == (OK if state == OK else WARNING), "another device is in use"
 
 
@@ -572,7 +572,7 @@ def test_the_worst_of_several_outputs_counts(monkeypatch: pytest.MonkeyPatch) ->
     def levels(*texts: str) -> list[Finding]:
         outputs = [(f"out{number}", text, "unmute", "louder") for number, text in enumerate(texts)]
         monkeypatch.setattr(sound, "_read_levels", lambda *_: outputs)
-        return sound.check_levels({}, NO_SERVER, CARDS, is_used=True)
+        return sound.check_levels({}, NO_SERVER, CARDS, in_use=True)
 
     assert levels() == []
     assert [finding.message for finding in levels("[40%] [on]", "[on]")] == ["out0 is at 40%, out1 is not muted"]

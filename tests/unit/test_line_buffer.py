@@ -12,8 +12,8 @@ def test_the_ttl_of_a_line_starts_when_its_newline_is_read() -> None:
     assert [(line.number, line.text) for line in buffer.take_expired(109.9)] == []
     assert [(line.number, line.text) for line in buffer.take_expired(110.0)] == [(1, "one")]
     assert buffer.first is not None
-    assert (buffer.first.number, buffer.first.end) == (2, 113.0)
-    assert [(line.number, line.end) for line in buffer.take_expired(1000.0)] == [(2, 113.0), (4, 115.0)]
+    assert (buffer.first.number, buffer.first.expires_at) == (2, 113.0)
+    assert [(line.number, line.expires_at) for line in buffer.take_expired(1000.0)] == [(2, 113.0), (4, 115.0)]
     assert buffer.first is None
     assert buffer.ended
 
@@ -29,7 +29,7 @@ def test_without_a_ttl_no_line_expires() -> None:
         buffer = LineBuffer(ttl)
         buffer.feed(b"one\n", 0.0)
         assert list(buffer.take_expired(1e9)) == []
-        assert buffer.take().end == float("inf")
+        assert buffer.take().expires_at == float("inf")
 
 
 def test_blank_lines_are_skipped_but_numbered_and_oversize_lines_are_kept() -> None:

@@ -9,7 +9,7 @@ from talkcli.fleet.payloads import LastGoal, Presence, RobotInfo, RobotStatus
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.states import State
 from talkcli.terminal.goals import clock_time
-from talkcli.terminal.text import COLUMN_GAP, Screen, cut, pad, printable, shorten, width
+from talkcli.terminal.text import COLUMN_GAP, Screen, cut, cut_quoted, pad, printable, width
 from talkcli.terminal.transcript import ColumnWidths, Transcript
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def _format_row(cells: dict[str, Cell], widths: dict[str, int], screen: Screen) 
     for name, columns in widths.items():
         text, state = cells[name]
         if name == "SPEAKING" and screen.width is not None:
-            text = shorten(text, columns)
+            text = cut_quoted(text, columns)
         text = pad(text, columns)
         shown.append(text if state is None else screen.coloured(text, state))
     return COLUMN_GAP.join(shown).rstrip()

@@ -324,7 +324,7 @@ def load_libraries(model_path: str) -> None:
         import numpy as np  # noqa: F401 - onnxruntime would hide the reason if numpy can't be imported
         import onnxruntime  # noqa: F401
     except Exception as error:
-        raise _model_error(model_path, "could not be loaded", error, f"run: {install.neural()}") from error
+        raise _model_error(model_path, "could not be loaded", error, f"run: {install.neural_command()}") from error
 
 
 def _split_and_cache(path: str, content: bytes, cache: ModelCache | None, key: str) -> tuple[Any, Any]:
