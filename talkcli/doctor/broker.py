@@ -198,7 +198,7 @@ class BrokerExamination:
         link.subscribe(robot(topics.PRESENCE), retained=True)
         tested = {echo: _ECHO_PAYLOAD} | dict.fromkeys(others, b"")
         for topic, payload in tested.items():
-            link.publish(Message(topic, payload), acknowledged=partial(codes.__setitem__, topic))
+            link.publish(Message(topic, payload), on_acknowledged=partial(codes.__setitem__, topic))
         now = time.monotonic()
         end = now + LOGIN_LIMIT_S
         is_acknowledged = is_back = False

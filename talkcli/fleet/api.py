@@ -87,10 +87,10 @@ class Fleet:
         return Client.over(connect_robot(name, self._broker, name=self._name))
 
     def say(self, to: str, text: str, *, wait: bool = True, ttl: float | None = None, **options: Any) -> FleetRequest:
-        """Speak a text on each robot.
+        """Speak a text on each robot, and return the request, which yields the outcomes.
 
-        Return the request, which yields the outcomes. The goal has the same id on all robots. To cancel it, call
-        `cancel` on the returned FleetRequest. After the last outcome, call `Fleet.cancel` with the id instead.
+        The goal has the same id on all robots. To cancel it, call `cancel` on the returned FleetRequest. After the last
+        outcome, call `Fleet.cancel` with the id instead.
 
         Args:
             to: the name of a robot, a pattern or a group.
@@ -110,32 +110,26 @@ class Fleet:
         before: str | None = None,
         key: str | None = None,
     ) -> FleetRequest:
-        """Cancel goals on each robot, by default all of them.
+        """Cancel goals on each robot, by default all of them, and return the request.
 
-        Return the request, which yields the outcomes. The other arguments are those of `Client.cancel`. The outcome of
-        a robot arrives when the robot is silent.
+        The request yields the outcomes. The other arguments are those of `Client.cancel`. The outcome of a robot
+        arrives when the robot is silent.
         """
         return self._send_request(to, Cancel(None if ids is None else tuple(ids), current, before, key))
 
     def wait(self, to: str, ids: Iterable[str] | None = None) -> FleetRequest:
-        """Wait for goals on each robot to end, by default all current ones.
-
-        Return the request, which yields the outcomes.
-        """
+        """Return a request that waits for goals on each robot to end, by default all current ones."""
         return self._send_request(to, Wait(None if ids is None else tuple(ids)))
 
     def status(self, to: str) -> FleetRequest:
-        """Request the status of each robot's server.
+        """Request the status of each robot's server, and return the request.
 
-        Return the request, which yields the outcomes. Each outcome contains the status as `said["status"]`.
+        The request yields the outcomes. Each outcome contains the status as `said["status"]`.
         """
         return self._send_request(to, Status())
 
     def pause(self, to: str) -> FleetRequest:
-        """Pause speech on each robot until `resume` is called.
-
-        Return the request, which yields the outcomes.
-        """
+        """Pause speech on each robot until `resume` is called, and return the request."""
         return self._send_request(to, Pause())
 
     def resume(self, to: str) -> FleetRequest:
@@ -143,10 +137,10 @@ class Fleet:
         return self._send_request(to, Resume())
 
     def set(self, to: str, **settings: Any) -> FleetRequest:
-        """Change the settings of each robot's server.
+        """Change the settings of each robot's server, and return the request.
 
-        Return the request, which yields the outcomes. If a robot's bridge doesn't allow this, its outcome is REFUSED.
-        The arguments are those of `Client.set`.
+        The request yields the outcomes. If a robot's bridge doesn't allow this, its outcome is REFUSED. The arguments
+        are those of `Client.set`.
         """
         return self._send_request(to, Set(**settings))
 

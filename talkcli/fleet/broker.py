@@ -22,6 +22,7 @@ from talkcli.terminal.text import printable
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+# Names of environment variables.
 URL = "TALK_BROKER"
 USER = "TALK_MQTT_USER"
 PASSWORD_FILE = "TALK_MQTT_PASSWORD_FILE"
@@ -114,9 +115,7 @@ def require_paho() -> None:
 
 
 def client_user(broker: Broker) -> str:
-    """Return the user name to use in topics.
-
-    This is the user name of the login, or the name of the local user if the login has none.
+    """Return the user name for topics: that of the login, or else of the local user.
 
     Raises:
         UsageError: the name isn't allowed in a topic.

@@ -95,8 +95,8 @@ class Link:
             on_message: called with each received message.
             will: retained message that the broker publishes if the connection breaks.
             max_packet_bytes: largest packet that the broker may send.
-            receive_maximum: how many unacknowledged QoS 1 messages the broker may send. If None, the
-                broker's default applies, so that a flood of messages can't stop mosquitto from delivering later ones.
+            receive_maximum: how many unacknowledged QoS 1 messages the broker may send. If None, the broker's default
+                applies, so that a flood of messages can't stop mosquitto from delivering later ones.
 
         Raises:
             UsageError: a certificate or key file is unusable.
@@ -226,13 +226,13 @@ class Link:
             if self.ended is None:
                 self._paho.loop_misc()
 
-    def publish(self, message: Message, qos: int = 1, acknowledged: OnAcknowledged | None = None) -> bool:
-        """Publish a message if the connection is still open.
+    def publish(self, message: Message, qos: int = 1, on_acknowledged: OnAcknowledged | None = None) -> bool:
+        """Publish a message, or return False if the connection has ended.
 
         Args:
             message: the message. Its payload has at most `max_payload_bytes`.
             qos: 0 or 1.
-            acknowledged: called with the reason code of the broker's acknowledgement of a QoS 1 message.
+            on_acknowledged: called with the reason code of the broker's acknowledgement of a QoS 1 message.
         """
         topic, payload = message.topic, message.payload
         properties = _properties(message.expiry, message.response, message.correlation)
@@ -244,7 +244,7 @@ class Link:
                 return False
             if not info.is_published():
                 size = len(topic) + len(payload)
-                self._unacknowledged[info.mid] = size, acknowledged
+                self._unacknowledged[info.mid] = size, on_acknowledged
                 self.outstanding_bytes += size
             self.write()
         return True
@@ -280,7 +280,7 @@ class Link:
                 self._socket = None
 
     def drop(self) -> None:
-        """Close a forked child's copy of the descriptor."""
+        """Close a forked child's copy of the descriptor, without ending the connection."""
         if self._socket is not None:
             os.close(self._socket.detach())
 
@@ -337,10 +337,10 @@ class Link:
 
     def _on_publish(self, _client: paho.Client, _data: object, mid: int, code: ReasonCode, _: object) -> None:
         """Call the callback of a message that the broker has acknowledged."""
-        size, acknowledged = self._unacknowledged.pop(mid, (0, None))
+        size, on_acknowledged = self._unacknowledged.pop(mid, (0, None))
         self.outstanding_bytes -= size
-        if acknowledged:
-            acknowledged(code.value)
+        if on_acknowledged:
+            on_acknowledged(code.value)
 
     def _on_log(self, _client: paho.Client, _data: object, _level: int, text: str) -> None:
         """Store the TLS alert from a line that paho logs during the login."""
@@ -389,10 +389,7 @@ class LinkOpener:
                 self.link.close()
 
     def _open(self) -> None:
-        """Open the link and store any error.
-
-        Then call `on_done`, or close the link if `cancel` was called.
-        """
+        """Open the link, store any error, and call `on_done` or close a canceled link."""
         try:
             self.link.open()
         except TalkError as error:

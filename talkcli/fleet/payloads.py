@@ -67,7 +67,7 @@ class Presence:
         said = _decode_object(payload)
         if said is None or topics.name_fault(name):
             return None
-        lists = {each: _texts(said.pop(each, None)) for each in ("groups", "allow")}
+        lists = {each: _strings_in(said.pop(each, None)) for each in ("groups", "allow")}
         return cls(**{**read_fields(cls, said), **lists, "name": name})
 
     def to_json(self) -> JsonObject:
@@ -163,7 +163,7 @@ def _decode_object(payload: bytes) -> JsonObject | None:
         return None
 
 
-def _texts(value: object) -> tuple[str, ...]:
+def _strings_in(value: object) -> tuple[str, ...]:
     """Return the strings in a list. For any other value, return an empty tuple."""
     return tuple(each for each in value if isinstance(each, str)) if isinstance(value, list) else ()
 
@@ -216,15 +216,15 @@ def homeassistant_device(name: str, allow: Collection[str], version: str) -> Mes
     return Message(topics.homeassistant_device(name), encode(payload), retained=True)
 
 
-def _command(name: str, kind: str, platform: str, label: str | None, *, allowed: bool) -> JsonObject:
-    """Return a Home Assistant component that sends a request."""
+def _command(robot: str, topic_level: str, platform: str, label: str | None, *, allowed: bool) -> JsonObject:
+    """Return a Home Assistant component that sends a request, or an empty one if not allowed."""
     if not allowed:
         return {"platform": platform}
-    topic = topics.robot(name, kind, topics.HOMEASSISTANT)
+    topic = topics.robot(robot, topic_level, topics.HOMEASSISTANT)
     return {"platform": platform, "command_topic": topic, "qos": 1, "name": label}
 
 
-def _sensor(name: str, label: str, template: str, platform: str = "sensor", **more: object) -> JsonObject:
+def _sensor(robot: str, label: str, template: str, platform: str = "sensor", **more: object) -> JsonObject:
     """Return a Home Assistant component that shows part of the robot's status."""
-    topic = topics.robot(name, topics.STATUS)
+    topic = topics.robot(robot, topics.STATUS)
     return {"platform": platform, "name": label, "state_topic": topic, "value_template": template, "qos": 1, **more}

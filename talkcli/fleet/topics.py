@@ -36,7 +36,7 @@ HOMEASSISTANT_STATUS = f"{HOMEASSISTANT}/status"
 
 
 def name_fault(name: str) -> str | None:
-    """Return the reason why a robot, group or user name is invalid."""
+    """Return the reason why a robot, group or user name is invalid, or None if it is valid."""
     if _NAME_PATTERN.fullmatch(name):
         return None
     return f"must have 1 to {MAX_NAME_CHARS} characters (A-Z a-z 0-9 . _ -), and begin with a letter or a digit"
@@ -73,7 +73,7 @@ def homeassistant_device(name: str) -> str:
 
 
 def parse_request(topic: str) -> tuple[str, str] | None:
-    """Return the kind and the client's user name of a request topic.
+    """Return the kind and the user name in a request topic, or None for any other topic.
 
     Returns:
         REQUEST, PLAIN_SAY or PLAIN_CANCEL, and the client's user name. The broker's access rules verify the name.
@@ -86,12 +86,12 @@ def parse_request(topic: str) -> tuple[str, str] | None:
     return (kind, user) if kind in kinds else None
 
 
-def checked_reply(response: str, user: str, robot_name: str) -> str | None:
-    """Return the topic for a robot's reply, if the client may use it.
+def checked_reply_topic(response_topic: str, user: str, robot_name: str) -> str | None:
+    """Return the topic for a robot's reply, or None if the client may not use it.
 
     This prevents users from making a robot publish to other users or to another robot's topic.
     """
-    levels = response.split("/")
+    levels = response_topic.split("/")
     if levels[:3] != [PREFIX, _REPLY, user] or len(levels) not in (4, 5) or name_fault(levels[3]):
         return None
     return reply(user, levels[3], robot_name) if levels[4:] in ([], [robot_name]) else None

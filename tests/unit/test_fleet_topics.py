@@ -64,7 +64,7 @@ def test_a_topic_contains_the_request_and_the_user(topic: str, parsed: tuple[str
     ],
 )
 def test_a_robot_replies_only_to_the_remote_clients_own_topic(response: str, answer: str | None) -> None:
-    assert topics.checked_reply(response, "olga", "anna") == answer
+    assert topics.checked_reply_topic(response, "olga", "anna") == answer
 
 
 # The access control list

@@ -41,7 +41,7 @@ class LocalConnection(ClientCore):
         self._lines: list[bytes] = []
 
     async def greet(self, hello: JsonObject) -> None:
-        """Send `hello`, and wait for the server's greeting.
+        """Send a `hello` request, and wait for the server's greeting.
 
         Close the connection if this fails.
 
@@ -85,7 +85,7 @@ class LocalConnection(ClientCore):
         return lines
 
     def send(self, exchange: Exchange) -> bool:
-        """Send an exchange's request, or return False if the request is too long."""
+        """Send a request and expect its answer, or return False if the request is too long."""
         self.register(exchange, self._loop.time())
         line = self.line(exchange)
         if len(line) > MAX_LINE_BYTES:

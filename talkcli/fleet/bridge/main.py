@@ -203,10 +203,7 @@ class Bridge:
     # -- the connection
 
     async def _stay_connected(self) -> None:
-        """Connect to the broker.
-
-        Whenever the connection ends, read the broker's settings again and reconnect.
-        """
+        """Stay connected to the broker, and read its settings again before each reconnection."""
         client_id = f"talk-{self._settings.name}-{self._session}"
         while True:
             try:
@@ -228,7 +225,7 @@ class Bridge:
                 log.write_limited("settings", f"{log.sanitize(str(error))}; the previous settings are used")
 
     async def _open_link(self, link: Link) -> None:
-        """Open a connection to the broker in a thread, and wait for it without blocking the event loop."""
+        """Open a connection to the broker in a thread, without blocking the event loop."""
         done = asyncio.Event()
         opener = LinkOpener(link, lambda: self._loop.call_soon_threadsafe(done.set))
         try:
@@ -274,10 +271,7 @@ class Bridge:
         log.write(f"online at {self._broker.url}")
 
     def _disconnect(self, link: Link) -> None:
-        """Close a connection to the broker.
-
-        If it is the current one, also end the sessions of all clients.
-        """
+        """Close a connection, and end all clients' sessions if it is the current one."""
         if self._link is link:
             self._link, self._online = None, False
             self._unwatch_link()
@@ -298,13 +292,13 @@ class Bridge:
             self._descriptor = -1
 
     def _on_ready(self, action: Callable[[Link], None]) -> None:
-        """Call `Link.read` or `Link.write` when the link's descriptor is ready, and handle the link's new state."""
+        """Read or write with `action` when the link is ready, and handle the link's new state."""
         if link := self._link:
             action(link)
             self._handle_link_state(link)
 
     def _handle_link_state(self, link: Link) -> None:
-        """Close a link that is stuck, disconnect one that has ended, and pause sessions while the broker is slow.
+        """Close a stuck link, disconnect an ended one, and pause sessions while the broker is slow.
 
         Call this after each use of the link.
         """
@@ -329,11 +323,10 @@ class Bridge:
         else:
             self._loop.remove_writer(self._descriptor)
 
-    def _publish(self, message: Message, qos: int = 1, acknowledged: OnAcknowledged | None = None) -> None:
-        """Publish a message if there is a connection.
+    def _publish(self, message: Message, qos: int = 1, on_acknowledged: OnAcknowledged | None = None) -> None:
+        """Publish a message, unless there is no connection or the message is too long.
 
-        Drop it if it is too long for the broker. The arguments are those of `Link.publish`. By default, a warning is
-        logged if the broker rejects the message.
+        The arguments are those of `Link.publish`. By default, a warning is logged if the broker rejects the message.
         """
         link = self._link
         if link is None:
@@ -342,14 +335,11 @@ class Bridge:
             words = f"dropped a message of {len(message.payload):,} bytes for {message.topic}"
             log.write_limited("long", f"{words}: the broker accepts at most {link.max_payload_bytes:,}")
             return
-        link.publish(message, qos, acknowledged or self._log_if_denied)
+        link.publish(message, qos, on_acknowledged or self._log_if_denied)
         self._handle_link_state(link)
 
     def _publish_to_all(self, message: Message) -> None:
-        """Publish a status or an event, if the robot is online.
-
-        Drop events while the broker is slow.
-        """
+        """Publish a status or an event if the robot is online. Drop events if the broker is slow."""
         if self._online and self._link and (message.retained or self._link.outstanding_bytes <= SLOW_BROKER_BYTES):
             self._publish(message)
 
@@ -400,7 +390,7 @@ class Bridge:
                 self._send_echo()
 
     def _handle_echo(self, payload: bytes) -> None:
-        """Process this bridge's own echo, or another bridge's question whether the robot's name is in use."""
+        """Record a returned echo, or respond to a bridge that asks whether the name is in use."""
         if payload.startswith(_RIVAL_QUESTION):
             if payload != _RIVAL_QUESTION + self._session.encode():
                 if self._online:
@@ -414,10 +404,9 @@ class Bridge:
             self._policy.record_echo(sent_at, boottime())
 
     def _handle_presence(self, payload: bytes) -> None:
-        """Check a presence message for another bridge with this robot's name.
+        """End this bridge if an older one has its name, or tell a younger one that it is taken.
 
-        The younger of the two bridges ends. It may come from this bridge, an earlier one, or another one with the same
-        robot name.
+        The message may come from this bridge, an earlier one, or another one with the same robot name.
         """
         presence = Presence.read(self._settings.name, payload)
         rank = bridge_rank(presence)
@@ -483,10 +472,7 @@ class Bridge:
             self._publish_presence()
 
     async def _go_offline(self) -> None:
-        """Disconnect from the broker.
-
-        Report the robot as offline first, unless another bridge uses its name.
-        """
+        """Report the robot as offline unless another bridge uses its name, and disconnect."""
         link = self._link
         if link is None:
             return
@@ -497,7 +483,7 @@ class Bridge:
         # Otherwise, `Link.close` would not send a DISCONNECT packet, and the broker would publish the will. The robot
         # would seem to be offline.
         message = self._will if was_online else Message(self._echo_topic, f"{self._session} 0".encode())
-        self._publish(message, acknowledged=lambda _: taken.set())
+        self._publish(message, on_acknowledged=lambda _: taken.set())
         with contextlib.suppress(asyncio.TimeoutError):
             await asyncio.wait_for(taken.wait(), _OFFLINE_LIMIT_S)
         self._disconnect(link)

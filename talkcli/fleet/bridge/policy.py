@@ -64,7 +64,7 @@ class RemoteRequest:
     start_by: float | None = None
 
     def build_say(self, goal_id: str, now: float) -> Say:
-        """Return the `say` request for the server, with an id and with a TTL limited by the message's expiry.
+        """Return the `say` request for the server, with an id and a TTL up to the message's expiry.
 
         Args:
             goal_id: the goal's id.
@@ -126,7 +126,7 @@ class Policy:
         self.newest_echo_at = 0.0
 
     def record_echo(self, sent_at_text: bytes, now: float) -> None:
-        """Record that an echo has returned.
+        """Record the sending time of an echo that has returned.
 
         Ignore it if its time is invalid or later than `now`.
         """
@@ -148,7 +148,7 @@ class Policy:
             return Ignored("retained", f"dropped a retained message on {message.topic}, because it may be old")
         reply_topic = None
         if message.response is not None:
-            reply_topic = topics.checked_reply(message.response, user, self._name)
+            reply_topic = topics.checked_reply_topic(message.response, user, self._name)
             if reply_topic is None:
                 words = f"its response topic {message.response} belongs to another client"
                 return Ignored("response", f"dropped a message of {user}: {words}")
@@ -323,9 +323,6 @@ def sender_name(user: str, name: str | None = None) -> str:
 
 
 def remote_user(goal: Goal) -> str | None:
-    """Return the name of the user who sent a goal.
-
-    Return None if the sender was a local client.
-    """
+    """Return the name of the remote user who sent a goal, or None for a local client."""
     name = (goal.client and goal.client.name) or ""
     return name.removeprefix(topics.REMOTE_PREFIX).split(" ")[0] if name.startswith(topics.REMOTE_PREFIX) else None

@@ -160,17 +160,14 @@ class Publisher:
         for each in unfinished(status):
             self._sessions.remember(each, server.boot)
         log.write(f"connected to the server at {log.sanitize(server.path)} (pid {server.pid})")
-        about: JsonObject = {"boot": server.boot, "pid": server.pid, "version": status.server.get("version")}
+        server_info: JsonObject = {"boot": server.boot, "pid": server.pid, "version": status.server.get("version")}
         # Leave out features that this bridge doesn't know, because it may not pass on their requests.
-        about["features"] = [each for each in FEATURES if each in (server.server.features or ())]
-        self._set_server(about, status, server.boot)
+        server_info["features"] = [each for each in FEATURES if each in (server.server.features or ())]
+        self._set_server(server_info, status, server.boot)
 
-    def _set_server(self, about: JsonObject | None, status: ServerStatus, boot: str) -> None:
-        """Store a new state of the server and its goals, and report the change.
-
-        `about` replaces `server`.
-        """
-        self.server = about
+    def _set_server(self, server_info: JsonObject | None, status: ServerStatus, boot: str) -> None:
+        """Store the new state of the server and its goals, and report the change."""
+        self.server = server_info
         self._active = status.active.id if status.active else None
         self._texts = {each.id: _shown_text(each) for each in unfinished(status)}
         self._last = status.recent[-1] if status.recent else self._last

@@ -93,16 +93,13 @@ class RemoteSessions:
         self._loop = asyncio.get_running_loop()
         self._sessions: dict[tuple[str, str | None], RemoteSession] = {}
         self._release_handle: asyncio.Handle | None = None
-        #: the client that has canceled pending goals since `_release` last ran; None if no client has
+        #: the client that has canceled pending goals since `_send_or_cancel_waiting` last ran; None if no client has
         self._canceled_by: By | None = None
 
     # -- from the broker
 
     def submit(self, request: RemoteRequest) -> None:
-        """Pass a request to its client's session.
-
-        Create the session, or refuse the request if there are too many.
-        """
+        """Pass a request to its client's session, or refuse it if there are too many sessions."""
         key = request.user, request.reply_topic
         session = self._sessions.get(key) or RemoteSession(self, *key)
         if key in self._sessions or self._make_room(urgent=isinstance(request.request, Cancel | Status)):
@@ -112,12 +109,12 @@ class RemoteSessions:
             session.refuse(request, Busy.code, f"{self.name} already has {MAX_SESSIONS} remote clients")
 
     def handle_goodbye(self, user: str, reply_topic: str) -> None:
-        """End the session of a client that has said goodbye, once the server has answered its important requests."""
+        """End a session after the client's goodbye, once its important requests are answered."""
         if session := self._sessions.get((user, reply_topic)):
             session.handle_goodbye()
 
     def end_all(self) -> None:
-        """End all sessions without informing the clients, because the connection to the broker has ended."""
+        """End all sessions without informing the clients, because the broker is disconnected."""
         for session in list(self._sessions.values()):
             session.end()
         self.may_read.set()
@@ -136,9 +133,9 @@ class RemoteSessions:
                 session.send_alive()
 
     def _make_room(self, *, urgent: bool) -> bool:
-        """End an idle session if there are too many sessions.
+        """End an idle session if there are too many, and return whether there is room for one.
 
-        Return whether there is room for a new one. For an `urgent` request, any session may be ended.
+        For an `urgent` request, any session may be ended.
         """
         if len(self._sessions) < MAX_SESSIONS:
             return True
@@ -159,25 +156,25 @@ class RemoteSessions:
         """Return the total size of all clients' unanswered requests."""
         return sum(each.size_bytes for session in self._sessions.values() for each in session.unanswered)
 
-    def cancel_waiting(self, selection: Cancel, canceled_by: By | None) -> list[Goal]:
+    def cancel_waiting(self, cancel: Cancel, canceled_by: By | None) -> list[Goal]:
         """Cancel the goals waiting in the bridge that match a `cancel` request, and return them."""
-        selected = [self.waiting[each] for each in selection.select_waiting([say for _, say, _ in self.waiting])]
+        selected = [self.waiting[each] for each in cancel.select_waiting([say for _, say, _ in self.waiting])]
         self.waiting = [each for each in self.waiting if not any(each is other for other in selected)]
         ending = State.RECALLED, "canceled", "not spoken: the goal was cancelled before it started", canceled_by
         return [session.end_goal(request, say, *ending) for request, say, session in selected]
 
     def handle_pending_change(self) -> None:
-        """Call `on_change`, and schedule a call of `_release` if any goals are waiting.
+        """Report a change of the pending goals, and schedule an attempt to send waiting goals.
 
         Call this whenever the number of pending goals may have changed. Events that were received together are all
         processed before goals are released.
         """
         self._on_change()
         if self.waiting and self._release_handle is None:
-            self._release_handle = self._loop.call_soon(self._release)
+            self._release_handle = self._loop.call_soon(self._send_or_cancel_waiting)
 
-    def _release(self) -> None:
-        """Send waiting goals to the server while there is room, or cancel them if a client has canceled all goals."""
+    def _send_or_cancel_waiting(self) -> None:
+        """Send waiting goals while there is room, or cancel them if a client canceled all goals."""
         self._release_handle = None
         canceled_by, self._canceled_by = self._canceled_by, None
         if canceled_by and not self.goals.pending_count:
@@ -271,7 +268,7 @@ class RemoteSession:
         return not (self.unanswered or self._awaited or self._watching)
 
     def submit(self, request: RemoteRequest) -> None:
-        """Send a request, queue it until the server is connected, or refuse it if too many are unanswered."""
+        """Send a request, queue it until the server is connected, or refuse it if there are too many."""
         self.used_at = self._loop.time()
         if self._said_goodbye:  # the client has returned
             self._said_goodbye, self._reply_topic = False, request.reply_topic
@@ -289,7 +286,7 @@ class RemoteSession:
                 self._task = asyncio.create_task(self._run(urgent=urgent))
 
     def handle_goodbye(self) -> None:
-        """Drop the client's waiting goals, and end the session when its important requests have been answered.
+        """Drop the client's waiting goals, and end the session once important requests are answered.
 
         The client gets no more answers, and its waiting goals are dropped. The session stays open until the server has
         answered requests with a lasting effect.
@@ -340,7 +337,7 @@ class RemoteSession:
         self._sessions.waiting = [each for each in self._sessions.waiting if each[2] is not self]
 
     def _end_if_done(self) -> None:
-        """End the session if the client has said goodbye and its important requests have been answered.
+        """End the session if the client has said goodbye and important requests are answered.
 
         If `end` was called before the server was connected, close the connection.
         """
@@ -350,10 +347,7 @@ class RemoteSession:
     # -- to the server
 
     def _send_request(self, remote: RemoteRequest) -> None:
-        """Send a client's request to the server.
-
-        Goals may have to wait, and `cancel` first cancels waiting goals.
-        """
+        """Send a client's request to the server, after changing, delaying or refusing it if needed."""
         request = remote.request
         if isinstance(request, Say):
             self.send_say(remote, request)
@@ -370,9 +364,7 @@ class RemoteSession:
             self._send(_RemoteExchange(remote, request))
 
     def send_say(self, remote: RemoteRequest, say: Say, *, has_room: bool = False) -> None:
-        """Send a goal to the server, or reject it if too many goals are pending.
-
-        Patient goals wait for room.
+        """Send a goal to the server. If too many are pending, let it wait or reject it.
 
         Args:
             remote: the client's request.
@@ -431,7 +423,7 @@ class RemoteSession:
     # -- from the server
 
     async def _run(self, *, urgent: bool) -> None:
-        """Connect to the server, send the queued requests, and publish lines until the connection ends."""
+        """Connect to the server, send queued requests, and publish lines until the connection ends."""
         shared = self._sessions
         try:
             # A session that ends meanwhile keeps its slot until the server answers. If the server hangs, its backlog
@@ -480,10 +472,7 @@ class RemoteSession:
         self._end_if_done()
 
     def _process_answer(self, message: JsonObject) -> list[tuple[bytes, bytes | None]]:
-        """Process one line of the server's answer.
-
-        Return lines for the client, with their correlation data.
-        """
+        """Process one line of an answer, and return lines for the client with correlation data."""
         assert self._server
         exchange = self._server.match(message)
         if not isinstance(exchange, _RemoteExchange):
@@ -509,10 +498,7 @@ class RemoteSession:
         return [(encode(item(remote.seq, **each)), remote.correlation) for each in (*found, message)]
 
     def _record_say_reply(self, exchange: _RemoteExchange, state: State | None, *, refused: bool) -> None:
-        """If a request is a `say`, record whether its goal is pending.
-
-        Forget the id of a refused goal.
-        """
+        """Record whether the goal of a `say` request is pending, and forget a refused goal's id."""
         if exchange.goal_id is not None:
             self._sessions.goals.record_reply(exchange.goal_id, pending=state is State.PENDING)
             if exchange.is_new and refused:
@@ -574,7 +560,7 @@ class RemoteSession:
             self._sessions.publish(Message(self._reply_topic, payload, correlation=current), int(reliable))
 
     def _shorten_line(self, line: bytes, limit: int) -> bytes:
-        """Shorten a line that is too long for the broker.
+        """Return a shorter line for the broker: without texts, or an error, or nothing.
 
         Return the line without texts if that is short enough. Otherwise, return an error in place of a reply, and an
         empty line in place of an event.

@@ -148,10 +148,7 @@ class DeskLink:
         return descriptor in ready
 
     def _receive(self, message: Message) -> None:
-        """Pass a message to the handler.
-
-        If it is the marker message, record the time of its arrival instead.
-        """
+        """Pass a message to the handler, or record that the marker message has arrived."""
         if message.topic == self.reply_topic(topics.MARKER):
             self.marker_at = time.monotonic()
         else:
@@ -190,8 +187,8 @@ class DeskLink:
             request: the request.
             number: the number of the request, which is repeated in the answers.
             to: the name of the robot or the group.
-            on_refused: a function that is called with the error if the request is too long, or if the broker rejects
-                it later.
+            on_refused: a function that is called with the error if the request is too long, or if the broker rejects it
+                later.
             is_group: whether `to` is a group.
         """
         if self.link is None:
@@ -210,7 +207,7 @@ class DeskLink:
         expiry = (request.ttl or None) if isinstance(request, Say) else _REQUEST_EXPIRY_S
         topic, response = self._topics(to, is_group=is_group)
         message = Message(topic, line, response=response, expiry=expiry)
-        return self.link.publish(message, acknowledged=on_acknowledged)
+        return self.link.publish(message, on_acknowledged=on_acknowledged)
 
     def end_session(self, to: str, *, is_group: bool = False) -> None:
         """Tell the bridge of a robot, or all bridges of a group, that no more requests will follow."""
@@ -237,10 +234,10 @@ class DeskLink:
             self.poll(left)
 
     def close(self, *, forked: bool = False) -> None:
-        """Close the connection for good.
+        """Close the connection for good, or only the copies of the descriptors in a forked child.
 
         Args:
-            forked: whether this is a forked child process. Then only its copies of the file descriptors are closed.
+            forked: whether this is a forked child process.
         """
         if self._opening is not None and not forked:
             self._opening.cancel()
@@ -263,16 +260,13 @@ class DeskLink:
         return AccessDenied(f"{words}; add the lines of an operator to its access rules: talk bridge --print-acl")
 
     def _no_answer_error(self, timeout: float) -> TalkError:
-        """Return the error to raise if the broker hasn't sent its retained messages within `timeout` seconds."""
+        """Return the error to raise if the retained messages don't arrive within `timeout` seconds."""
         if self.link is None or self.marker_at is not None:
             return ServerUnavailable(f"the broker at {self.broker.url} did not answer within {timeout:g} s")
         return self._rejection_error(REASON_NOT_AUTHORIZED, f"read {topics.reply(self.user, '+', '+')}")
 
     def _maintain(self, link: Link | None, now: float) -> float:
-        """Connect, or keep the connection alive.
-
-        Return the number of seconds after which to call this again.
-        """
+        """Connect or keep the connection alive, and return the seconds until the next call is due."""
         if link is not None:
             link.tick()
             if self.marker_at is None or self.retained_received:
@@ -308,7 +302,7 @@ class DeskLink:
         link.subscribe(self.reply_topic(topics.MARKER), retained=False)
         self.handler.on_connected(link)
         # The broker sends this message back after the retained messages, so it marks their end.
-        link.publish(Message(self.reply_topic(topics.MARKER), b"\n"), acknowledged=self._on_marker_acknowledged)
+        link.publish(Message(self.reply_topic(topics.MARKER), b"\n"), on_acknowledged=self._on_marker_acknowledged)
 
     def _on_marker_acknowledged(self, code: int) -> None:
         """Store an error if the broker has rejected the marker message."""

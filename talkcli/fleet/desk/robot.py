@@ -66,7 +66,7 @@ class RobotExchange(Exchange):
     #: how many times the request has been sent again
     resends = 0
     #: when the sentence expires (by the `boottime` clock), or None if it never does
-    latest: float | None = None
+    expires_at: float | None = None
 
 
 class RobotConnection(Connection):
@@ -134,12 +134,12 @@ class RobotConnection(Connection):
         request = exchange.request
         if isinstance(request, Say) and isinstance(exchange, RobotExchange):
             exchange.request = replace(request, id=request.id or new_goal_id(self._desk))
-            exchange.latest = boottime() + request.ttl if request.ttl else None
+            exchange.expires_at = boottime() + request.ttl if request.ttl else None
         if not self._publish(exchange):
             self._desk.wake()  # The request will be sent when the robot is back.
 
     def expect_reply(self, exchange: RobotExchange) -> None:
-        """Register an exchange whose request was sent to the robot's group, so that it receives the answer."""
+        """Register a request that was sent to the robot's group, so that its answer is expected."""
         exchange.sent = True
         self._published_at = time.monotonic()
         self.register(exchange, self._published_at)
@@ -181,7 +181,7 @@ class RobotConnection(Connection):
         return True
 
     def answer_deadline(self, exchange: Exchange) -> float:
-        """Return the time by which a line of the answer must arrive, or by which an absent robot must be back."""
+        """Return when the next line of an answer is due, or when an absent robot must be back."""
         if not isinstance(exchange, RobotExchange):
             return float("inf")  # This is a lookup, which is repeated after each absence.
         if self.absent_since is None:
@@ -209,7 +209,7 @@ class RobotConnection(Connection):
         return ProtocolMismatch(f"{self.robot}: {error.message}") if error else None
 
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
-        """Return the error for a reply that refuses a request, with a special class for errors of the bridge."""
+        """Return the error for a refused request, with its own class for each error of the bridge."""
         error = super().refusal(reply, items)
         kinds = {"not_allowed": AccessDenied, "no_server": NoServer, "stale": ServerUnavailable, "lost": Lost}
         kind = kinds.get(error.code)
@@ -223,7 +223,7 @@ class RobotConnection(Connection):
         self._desk.poll(timeout, self._interrupt if interruptible else None)
 
     def keep_alive(self) -> None:
-        """Send a message if nothing has been sent for a while, so that the bridge doesn't end the session."""
+        """Send a message to keep the bridge's session alive, if nothing was sent for a while."""
         if time.monotonic() - self._published_at > _KEEP_ALIVE_INTERVAL_S:
             self._send_without_answer(Hello(self._sender))
 
@@ -254,10 +254,9 @@ class RobotConnection(Connection):
             self.absent_since = time.monotonic()
 
     def _update_presence(self, payload: bytes) -> None:
-        """Read from a presence message whether the robot is absent.
+        """Store a robot's presence, and send open requests again if the robot is back.
 
-        When it is back, send open requests again. It comes from the robot's bridge, or from the broker if the bridge
-        has lost its connection.
+        The message comes from the robot's bridge, or from the broker if the bridge has lost its connection.
         """
         try:
             presence = decode(payload.strip())
@@ -278,9 +277,7 @@ class RobotConnection(Connection):
     # -- connecting
 
     def wait_online(self, give_up: float) -> None:
-        """Wait until the robot can receive requests.
-
-        Raises an error if it still can't at the time `give_up`.
+        """Wait until the robot can receive requests, or raise an error at the time `give_up`.
 
         `give_up` is a monotonic time. The errors are the same as those of `connect_robot`.
         """
@@ -295,7 +292,7 @@ class RobotConnection(Connection):
         self.check_online()
 
     def check_online(self) -> None:
-        """Raise ServerUnavailable or ProtocolMismatch if the robot can't receive requests at the moment."""
+        """Raise ServerUnavailable or ProtocolMismatch if the robot can't receive requests now."""
         check_greeting(self._presence)
         if self.absent_since is not None:
             raise self._absence_error(f"{self.absence}, so nothing was sent")
@@ -329,17 +326,14 @@ class RobotConnection(Connection):
             self._watch_again(now)
 
     def _resend(self, exchange: RobotExchange) -> None:
-        """Send a request again.
-
-        It fails if its ttl has expired, or if it has been sent too many times.
-        """
+        """Send a request again, or fail it if it has expired or was sent too often."""
         if exchange.number not in self.exchanges:
             return  # The caller has stopped waiting for the answer.
         request = exchange.request
         if error := self.unsupported(request):
             self.fail(exchange, error)
             return
-        left = 0.0 if exchange.latest is None else exchange.latest - boottime()
+        left = 0.0 if exchange.expires_at is None else exchange.expires_at - boottime()
         exchange.resends += 1
         why = "its ttl was over before an answer came" if left < 0 else f"{self.absence} ({_MAX_RESENDS} times)"
         if isinstance(request, Say) and request.id in self._canceled:
@@ -362,10 +356,7 @@ class RobotConnection(Connection):
         return Lost(f"{words}; it may have been carried out")
 
     def _look_up_goal(self, exchange: RobotExchange, request: Say, now: float) -> None:
-        """Ask the robot whether it has accepted a goal.
-
-        If it doesn't know the goal, send the goal again.
-        """
+        """Ask the robot whether it has accepted a goal, and send the goal again if it hasn't."""
 
         def on_reply(_: JsonObject, items: list[JsonObject]) -> None:
             for each in items:
@@ -396,10 +387,7 @@ class RobotConnection(Connection):
             self._publish(exchange)
 
     def dispatch(self, message: JsonObject, now: float) -> Exchange | None:
-        """Process a message from the robot's server or bridge.
-
-        Return the exchange that it ends, or None.
-        """
+        """Process a message from the server or the bridge, and return the exchange that it ends."""
         if message.get("event") == "gone":
             self.end(printable(str(message.get("message") or "the connection to the server was lost")))
             return None
@@ -421,10 +409,7 @@ class RobotConnection(Connection):
         self._desk.wake()
 
     def _drop(self) -> None:
-        """Close the connection to the broker.
-
-        In a forked child, close only the child's descriptors.
-        """
+        """Close the connection to the broker, or only the copies in a forked child."""
         self._desk.close(forked=os.getpid() != self._process)
 
 

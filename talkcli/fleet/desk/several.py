@@ -111,7 +111,7 @@ class FleetRequest:
             self._rejected = too_long(request) if isinstance(request, Say) else None
             self._desk.wait_for_retained(patience_s, interrupt=interrupt)
             #: when the sentence expires (in `boottime`), or None if it never does
-            self._latest = boottime() + request.ttl if isinstance(request, Say) and request.ttl else None
+            self._expires_at = boottime() + request.ttl if isinstance(request, Say) and request.ttl else None
             self._began = True
             self._send_to_known_robots()
         except BaseException:
@@ -230,22 +230,16 @@ class FleetRequest:
                 self._on_presence(robot, robot.presence)
 
     def _on_refused(self, error: TalkError) -> None:
-        """Store an error for `results` to raise.
-
-        Called if the broker rejects the message to the group.
-        """
+        """Store the error of a rejected message to the group, which `results` raises."""
         self._refused = error
 
     def _check_for_late_robots(self) -> None:
-        """Process all waiting messages.
-
-        Then record a failure for each robot that hasn't answered in time.
-        """
+        """Process all waiting messages, and record a failure for each robot that is late."""
         for _ in range(_MAX_MESSAGES_PER_CHECK):
             if not self._desk.poll(0.0, self._interrupt):
                 break
         for name in list(self._unfinished):
-            self._update(name, check_time=True)
+            self._update(name, fail_if_late=True)
 
     def _no_robot_error(self) -> TalkError:
         """Return the error to raise if no robot matches the selection."""
@@ -288,7 +282,7 @@ class FleetRequest:
                 self._on_presence(robot, presence)
 
     def _on_presence(self, robot: RobotRequest, presence: Presence) -> None:
-        """Include a robot in the request when its presence first arrives.
+        """Include a robot when its presence first arrives, and later update its outcomes.
 
         Send the request if possible. After all retained messages have arrived, new robots are ignored, because they
         came online too late. Until then, every member of a group is expected to answer. Some members may have come
@@ -305,12 +299,12 @@ class FleetRequest:
         if (goal := self._rejected) is not None:
             self._record(Outcome(name, goal.state.name, goal.exit_code or EXIT_OK, goal))
         elif self._selection.group is not None and presence.online:
-            robot.expect_reply(self._number, self._latest)
+            robot.expect_reply(self._number, self._expires_at)
         else:
             robot.send()
 
     def _on_reply(self, name: str, message: Message) -> None:
-        """Process lines from a robot's server, and include the robot if it answers a request to its group.
+        """Process lines from a robot, and include it if it answers a request to its group.
 
         If a robot answers a request to a group, it is a member of the group, even if it seemed to be absent.
         """
@@ -319,7 +313,7 @@ class FleetRequest:
         robot = self._get_robot(name)
         if self._selection.group is not None and not robot.was_asked:
             self._include(name)
-            robot.expect_reply(self._number, self._latest)
+            robot.expect_reply(self._number, self._expires_at)
             if self._canceled_id is not None:
                 robot.connection.cancel_permanently(self._canceled_id, is_sent=False)
         robot.connection.on_message(message)
@@ -339,10 +333,10 @@ class FleetRequest:
         self._included.add(name)
         self._unfinished.add(name)
 
-    def _update(self, name: str, *, check_time: bool = False) -> None:
+    def _update(self, name: str, *, fail_if_late: bool = False) -> None:
         """Record the new outcomes of a robot, unless it is already finished."""
         if name in self._unfinished:
-            self._robots[name].update(check_time=check_time)
+            self._robots[name].update(fail_if_late=fail_if_late)
 
     def _record(self, *outcomes: Outcome) -> None:
         """Store outcomes for `results` to yield, and mark robots as finished after their last outcome."""
@@ -366,10 +360,7 @@ class RobotRequest:
         self._since = time.monotonic()
 
     def send(self) -> None:
-        """Send the request to this robot only, not to its group.
-
-        Record a failure if the robot is absent.
-        """
+        """Send the request to this robot only, or record a failure if the robot is absent."""
         try:
             self.connection.check_online()
             self.connection.begin(self._request, self._on_reply, self._on_failure)
@@ -377,26 +368,26 @@ class RobotRequest:
         except TalkError as error:
             self._on_failure(error)
 
-    def expect_reply(self, number: int, latest: float | None) -> None:
+    def expect_reply(self, number: int, expires_at: float | None) -> None:
         """Prepare to receive the answer to the request, which was sent to the robot's group.
 
         Args:
             number: the number of the request.
-            latest: when the sentence expires (in `boottime`), or None if it never does.
+            expires_at: when the sentence expires (in `boottime`), or None if it never does.
         """
         exchange = RobotExchange(self._request, self._on_reply, self._on_failure)
-        exchange.number, exchange.latest = number, latest
+        exchange.number, exchange.expires_at = number, expires_at
         self.connection.expect_reply(exchange)
         self.was_asked = True
 
-    def update(self, *, check_time: bool) -> None:
-        """Keep the bridge's session alive, and record the outcomes of goals that have ended since the last call.
+    def update(self, *, fail_if_late: bool) -> None:
+        """Keep the bridge's session alive, and record the outcomes of goals that have newly ended.
 
         Args:
-            check_time: whether to record a failure if the robot hasn't answered in time.
+            fail_if_late: whether to record a failure if the robot hasn't answered in time.
         """
         self.connection.keep_alive()
-        if check_time:
+        if fail_if_late:
             now = time.monotonic()
             self.connection.expire(now)
             silent_at, why = self.connection.silent_by(self._since)
@@ -410,10 +401,7 @@ class RobotRequest:
             self._record(Outcome(self._name, handle.state.name, code, handle.goal, last=not self._handles))
 
     def _on_reply(self, reply: JsonObject, items: list[JsonObject]) -> None:
-        """Start waiting for the goals of the request.
-
-        If there are none to wait for, record the outcomes.
-        """
+        """Start waiting for the request's goals, or record the outcomes if there are none."""
         request = self._request
         found: list[Goal] = []
         if isinstance(request, Say):
@@ -429,7 +417,7 @@ class RobotRequest:
             self._record(*reply_outcomes(self._name, request, reply, items))
 
     def _on_failure(self, error: TalkError) -> None:
-        """Record the failure of the request, after the outcomes of any goals that it could cancel."""
+        """Record the failure of the request, after the outcomes of goals that it has canceled."""
         try:
             items = error.items if isinstance(error, UnknownGoal) else []
             self._record(*outcomes_of_cancel(self._name, items, last=False))

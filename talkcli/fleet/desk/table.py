@@ -64,7 +64,7 @@ def _row_cells(robot: RobotInfo, screen: Screen, now: float) -> dict[str, Cell]:
         else:
             cells |= {
                 "SERVER": (version, None),
-                "SPEAKING": _speaking_cell(status, replace(screen, boot=_boot(presence))),
+                "SPEAKING": _speaking_cell(status, replace(screen, boot=_boot_id(presence))),
                 "QUEUE": (str(status.pending), None),
             }
         if presence.since is not None:
@@ -80,7 +80,7 @@ def _server_version(presence: Presence) -> str | None:
     return None if server is None else printable(str(server.get("version") or "?"), _MAX_VERSION_CHARS)
 
 
-def _boot(presence: Presence) -> str:
+def _boot_id(presence: Presence) -> str:
     """Return the boot id of the robot's server, or an empty string if the robot has no server."""
     return str((presence.server or {}).get("boot") or "")
 
@@ -112,7 +112,7 @@ def _format_age(seconds: float) -> str:
 
 
 def _fit_columns(widths: dict[str, int], room: int | None) -> None:
-    """Shrink the column SPEAKING in `widths`, and remove other columns, until a line fits into `room`."""
+    """Shrink or remove columns in `widths` until a line fits into `room` characters."""
     longest = widths["SPEAKING"]
     if room is None:
         widths["SPEAKING"] = min(longest, _USUAL_TEXT_CHARS)
@@ -155,13 +155,10 @@ class FleetTranscript:
         self._boots: dict[str, str] = {}
 
     def begin(self, robots: Sequence[Presence], broker: str, screen: Screen, now: float) -> list[str]:
-        """Return the first line, which shows how many robots there are.
-
-        Align later lines for these robots.
-        """
+        """Return the first line, which counts the robots, and align later lines by their names."""
         for each in robots:
             self._columns.pad_robot(each.name, screen)  # All names must be known first, so that all lines are aligned.
-            self._boots[each.name] = _boot(each)
+            self._boots[each.name] = _boot_id(each)
         offline = sum(not each.online for each in robots)
         serverless = sum(each.online and each.server is None for each in robots)
         parts = [f"{len(robots)} robot{'' if len(robots) == 1 else 's'}"]
@@ -178,7 +175,7 @@ class FleetTranscript:
         return self._transcripts[name].lines(event, screen, now)
 
     def change_lines(self, before: Presence | None, robot: Presence, screen: Screen, now: float) -> list[str]:
-        """Return a line saying that a robot or its server has changed, and forget the robot's earlier goals.
+        """Return a line about a change of a robot or its server, and forget the robot's goals.
 
         Args:
             before: the presence before the change, or None if the robot was unknown.
@@ -187,7 +184,7 @@ class FleetTranscript:
             now: the current time in seconds since 1970.
         """
         self._transcripts.pop(robot.name, None)
-        self._boots[robot.name] = _boot(robot)
+        self._boots[robot.name] = _boot_id(robot)
         server = "no server" if robot.server is None else f"talk {_server_version(robot)}"
         if not robot.online:
             word, state, more = "OFFLINE", State.LOST, ""

@@ -251,10 +251,7 @@ class FleetWatch:
     # -- time limits
 
     def _handle_due(self, now: float) -> None:
-        """Report missing robots, and process complete retained messages.
-
-        Raises Lost if the broker is away too long.
-        """
+        """Report missing robots and retained messages, or raise Lost if the broker stays away."""
         if self._retained is not None and self._desk.retained_received:
             self._process_retained(self._retained, now)
         if self._away_since is not None and now - self._away_since >= ABSENCE_LIMIT_S:
@@ -287,18 +284,15 @@ class FleetWatch:
         for event in events:
             self._report(event)
 
-    def _set_presence(self, name: str, now: Presence | None) -> None:
-        """Store a robot's presence.
-
-        Report it if the robot or its server has started or stopped.
-        """
+    def _set_presence(self, name: str, presence: Presence | None) -> None:
+        """Store a robot's presence, and report if the robot or its server started or stopped."""
         before = self._presences.pop(name, None)
-        if now:
-            self._presences[name] = now
+        if presence:
+            self._presences[name] = presence
             if before is None or not before.online:
                 self._maybe_missed.add(name)
-        if _identity(before) != _identity(now):
-            self._events.append(RobotChanged(name, before, now))
+        if _identity(before) != _identity(presence):
+            self._events.append(RobotChanged(name, before, presence))
 
     def _report_missed(self, name: str, status: RobotStatus | None, arrived: Container[str | None] = ()) -> None:
         """Report an EventsMissed if a robot's status shows goals that haven't been reported.
@@ -320,7 +314,7 @@ class FleetWatch:
             self._events.append(EventsMissed(RobotInfo(presence, status), tuple(missed)))
 
     def _report(self, robot_event: RobotEvent) -> None:
-        """Report an event of a selected robot, and remember goals that start or end to detect missed events."""
+        """Report an event of a selected robot, and remember its goal to detect missed events."""
         name, event = robot_event.name, robot_event.event
         if self._selection and name not in self._presences:
             return
