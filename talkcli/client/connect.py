@@ -258,7 +258,7 @@ def _server_may_start(attempt: ConnectionAttempt) -> bool:
 def _greet(
     attempt: ConnectionAttempt, hello: JsonObject, deadline: float, interrupt: Mapping[int, int] | None
 ) -> ConnectionAttempt:
-    """Send hello if necessary, and add the server's greeting to the attempt.
+    """Send hello if necessary, and return the attempt with the server's greeting.
 
     The connection is closed if the greeting has not arrived by `deadline` (monotonic), and after any other error.
 

@@ -203,10 +203,9 @@ class Connection(ClientCore):
         since: float | None = None,
         interruptible: bool = True,
     ) -> bool:
-        """Process messages until `done()` is true.
+        """Process messages until `done()` is true. Return False if the deadline passes first.
 
-        Return False if the deadline passes or the connection ends first. If the server is silent for too long, the
-        connection ends.
+        If the server is silent for too long, the connection ends.
 
         Args:
             done: called while the lock `changed` is held, and never again after it has returned True.

@@ -81,10 +81,10 @@ class EventBuffer:
         self.reconnects = reconnects
 
     def add(self, event: Event) -> None:
-        """Add an event unless it is a duplicate.
+        """Add a new event, or close the buffer if too many state changes are unread.
 
-        Close the buffer if too many state changes are unread. A closed buffer ignores all events. A connection that
-        waits for a goal and also watches all goals receives each state twice.
+        Duplicates are ignored, and a closed buffer ignores all events. A connection that waits for a goal and also
+        watches all goals receives each state twice.
         """
         number = getattr(event, "n", None)
         if number is not None and number == self._last_number:
@@ -580,7 +580,9 @@ class ClientCore:
         return min(times, default=float("inf"))
 
     def expire(self, now: float) -> bool:
-        """Fail late requests, and end goals as LOST if the client was disconnected too long.
+        """Enforce the time limits. Return False if the connection must be closed.
+
+        Late requests fail. Followed goals are LOST if the client was disconnected for too long.
 
         Returns:
             False if the connection must be closed, because a part of a line has been sent (see `forget`).

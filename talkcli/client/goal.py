@@ -208,7 +208,7 @@ class GoalHandle(TrackedGoal):
 
 
 def merged(handles: Sequence[GoalHandle], timeout: float | None = None) -> Iterator[tuple[GoalHandle, Event]]:
-    """Yield the events of several goals until all of them have ended.
+    """Yield the events of several goals, with their handles, until all goals have ended.
 
     The last event of each goal is its Result. A pause of all speech is yielded only once. If the connection ends, the
     remaining goals end as LOST.

@@ -76,7 +76,7 @@ def is_neural(voice: str) -> bool:
 
 @frozen
 class Kind:
-    """The value type of an option."""
+    """The type of an option's values, with its name and its error message."""
 
     #: name of the type in the protocol's document
     name: str
@@ -760,10 +760,7 @@ def bad_characters(text: str, max_chars: int | None, before_chars: int = 0) -> R
 
 
 def engine_options(say: Say, settings: Set) -> dict[str, Any]:
-    """Return the options that the engine needs for a goal, by name.
-
-    Omitted options come from the settings.
-    """
+    """Return a goal's options for the engine, with the server's settings as defaults."""
     found = {}
     for name in ENGINE_OPTIONS:
         own = getattr(say, name)

@@ -636,10 +636,7 @@ class Scheduler:
         return options.bad_text(say.text, limit) or refusal
 
     def _find_repeat(self, say: Say, record: Record, now: Now) -> Refusal | None:
-        """Return a refusal if a goal repeats another one within its `throttle` time.
-
-        In this case, also set `record.by` to the other goal.
-        """
+        """Return a refusal and set `record.by` if a goal repeats another one too soon."""
         if say.throttle is None:
             return None
         active = self.active

@@ -27,7 +27,7 @@ VOICE_PATIENCE_S = 10.0
 EXPIRY_MARGIN_S = 0.5
 #: Shortest and longest delay before a failed voice is loaded again. The delay doubles with each failure. A failed
 #: attempt costs a second of processor time, or even a sentence if the engine crashes.
-FIRST_VOICE_RETRY_S, LAST_VOICE_RETRY_S = 5.0, 3600.0
+MIN_VOICE_RETRY_S, MAX_VOICE_RETRY_S = 5.0, 3600.0
 #: A voice is considered faulty if the engine dies this many times in a row while loading it.
 MAX_ENGINE_DEATHS = 2
 
@@ -62,7 +62,7 @@ class NeuralVoice:
     def fail(self, why: str, now: float) -> None:
         """Record that loading the voice failed, and delay the next attempt."""
         self.failures += 1
-        self.retry_at = now + min(LAST_VOICE_RETRY_S, FIRST_VOICE_RETRY_S * 2 ** (self.failures - 1))
+        self.retry_at = now + min(MAX_VOICE_RETRY_S, MIN_VOICE_RETRY_S * 2 ** (self.failures - 1))
         self.state, self.why = VoiceState.FAILED, why
 
 

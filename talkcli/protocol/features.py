@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @frozen
 class Feature:
-    """A feature of the protocol."""
+    """A feature of the protocol that older servers lack."""
 
     #: what a server without the feature does not support, for error messages
     name: str

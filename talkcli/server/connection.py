@@ -120,7 +120,7 @@ class PendingRequest:
             self._step(in_time)
 
     def move_to(self, waiting_list: WaitingList) -> None:
-        """Move the request to another waiting list."""
+        """Put the request into this waiting list, and remove it from its current one."""
         self._leave()
         self.waiting_list = waiting_list
         waiting_list[self] = None

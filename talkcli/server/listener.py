@@ -92,10 +92,7 @@ class Listener:
         return former
 
     def close(self) -> None:
-        """Close the socket and release the lock.
-
-        Remove the socket file unless it was replaced.
-        """
+        """Close the socket, remove its file unless it was replaced, and release the lock."""
         if _identity(self.path) == self._identity:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(self.path)
@@ -242,10 +239,9 @@ def _refuse_live_socket(path: str) -> None:
 
 
 def _prepare_directory(directory: str) -> None:
-    """Create the socket's directory if necessary, and check that it is safe.
+    """Create the socket's directory if necessary, or raise AddressInUse if it isn't safe.
 
-    Raises:
-        AddressInUse: if the directory can't be created, or if other users could replace the socket in it.
+    It isn't safe if other users could replace the socket in it.
     """
     with _raise_in_use(f"can't create the socket's directory {directory}"), contextlib.suppress(FileExistsError):
         os.mkdir(directory, 0o700)

@@ -82,7 +82,7 @@ class Requests:
         return bool(connection.unanswered) or self._speech.subscribers.is_subscribed(connection)
 
     def left(self, connection: ClientConnection) -> None:
-        """Drop the requests and subscriptions of a client that has disconnected."""
+        """Drop the requests, subscriptions and incomplete texts of a disconnected client."""
         for each in list(connection.unanswered):
             each.drop()
         self._speech.subscribers.left(connection)

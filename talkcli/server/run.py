@@ -73,7 +73,7 @@ class ServerSettings:
 
 
 def serve(settings: ServerSettings) -> int:
-    """Run a server until it receives SIGTERM or SIGINT.
+    """Run a server until it receives SIGTERM or SIGINT, and return the exit code.
 
     Raises:
         AddressInUse: if another server is running, or the socket's directory isn't safe.
@@ -244,7 +244,7 @@ class Server:
             self._no_clients.clear()
 
     def left(self, connection: ClientConnection) -> None:
-        """Remove a client, and admit the next waiting one.
+        """Remove a client with its requests, and admit the next waiting client.
 
         The goals of the removed client continue.
         """

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.goals.voices import (
-    FIRST_VOICE_RETRY_S,
-    LAST_VOICE_RETRY_S,
     MAX_ENGINE_DEATHS,
+    MAX_VOICE_RETRY_S,
+    MIN_VOICE_RETRY_S,
     VoiceDropOrder,
     VoiceScheduler,
     VoiceState,
@@ -195,15 +195,15 @@ def test_a_failed_voice_is_retried_at_growing_intervals() -> None:
         assert voices.play("want a; next a", retry_at - 0.001).outcome() == "nothing; a failed"
         delays.append(retry_at - now)
         now = retry_at
-    assert delays[:3] == pytest.approx([FIRST_VOICE_RETRY_S, 2 * FIRST_VOICE_RETRY_S, 4 * FIRST_VOICE_RETRY_S])
-    assert delays[-1] == pytest.approx(LAST_VOICE_RETRY_S)
+    assert delays[:3] == pytest.approx([MIN_VOICE_RETRY_S, 2 * MIN_VOICE_RETRY_S, 4 * MIN_VOICE_RETRY_S])
+    assert delays[-1] == pytest.approx(MAX_VOICE_RETRY_S)
     voices.forget_failure("a")
     assert voices.play("want a", now).outcome() == "nothing; a waiting"
 
 
 def test_a_voice_still_counts_as_failed_while_it_is_retried() -> None:
     voices = ScriptedVoices().play("want a; next a; failed a")
-    assert voices.play("want a; next a", FIRST_VOICE_RETRY_S).outcome() == "a; a failed"
+    assert voices.play("want a; next a", MIN_VOICE_RETRY_S).outcome() == "a; a failed"
     assert voices.play("want a", 1000.0)._voices["a"].state is VoiceState.FAILED
     assert not voices.can_load
     assert voices.play("loaded a").to_json() == {"a": {"state": "loaded", "why": None}}
@@ -212,7 +212,7 @@ def test_a_voice_still_counts_as_failed_while_it_is_retried() -> None:
 def test_no_load_is_pending_once_no_goal_needs_the_voice() -> None:
     voices = ScriptedVoices().play("want a; next : b")
     assert (voices.can_load, voices.outcome()) == (False, "nothing; none")
-    voices.play("want a; next a; failed a").play("want a", FIRST_VOICE_RETRY_S)
+    voices.play("want a; next a; failed a").play("want a", MIN_VOICE_RETRY_S)
     assert voices.can_load
     assert (voices.play("next").outcome(), voices.can_load) == ("nothing; a failed", False)
 
