@@ -79,6 +79,7 @@ class Command:
     connects: bool = True
     #: the function that sends the command to several robots, as "module:name"
     fleet_function: str = ""
+    #: the function that checks which options can be combined
     rule: Rule | None = None
     #: the exit codes to show in the help, with their meanings
     exit_codes: ExitCodes | None = None

@@ -27,7 +27,7 @@ def _timeout_option(help_text: str) -> Option:
 
 
 def _print_unit_option(*names: str) -> Option:
-    """Return a --print-unit option with a choice of units."""
+    """Return a --print-unit option with a choice of systemd units."""
     words = f"Print a systemd unit with the given options, and exit. UNIT is one of {', '.join(names)}."
     return option("--print-unit", TEXT, words, metavar="UNIT", choices=names)
 

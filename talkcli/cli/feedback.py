@@ -112,7 +112,7 @@ class _TerminalFeedback(Feedback):
             self._paint()
 
     def show(self, goal: Goal, event: Event) -> None:
-        """Update the line after an event."""
+        """Update the line after an event, or write the whole sentence of a goal that has ended."""
         line = self._line
         if isinstance(event, Result):
             self._show_end(event.goal)

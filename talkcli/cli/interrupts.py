@@ -117,10 +117,7 @@ class Interrupts:
             discard_output()
 
     def prepare_cleanup(self) -> None:
-        """Clear the interrupt so that the cleanup can wait.
-
-        Only a new signal interrupts the cleanup.
-        """
+        """Clear the interrupt, so that only a new signal ends the waits of the cleanup."""
         if self.signal_number is not None:
             signal.set_wakeup_fd(-1)  # a second SIGHUP must not interrupt the cleanup
         self.watched.pop(STDOUT_FD, None)

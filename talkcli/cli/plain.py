@@ -212,7 +212,7 @@ def _is_full_id(goal_id: str) -> bool:
 
 
 def _say_request(given: dict[str, Any]) -> Say | None:
-    """Return the request to say a text, if the text is valid and short enough."""
+    """Return the request to say a text, or None if the text is invalid or too long."""
     options = {each.name: given[each.name] for each in Say.options if each.name in given}
     say = Say(**{**options, "text": " ".join(given["text"]), "wait": given["wait"] or given["feedback"]})
     try:

@@ -180,9 +180,9 @@ def reader_is_gone(error: OSError) -> bool:
 
 
 def handle_output_error(error: Exception) -> int | None:
-    """Discard further output after an output error, and return its exit code.
+    """Discard output and return the exit code after an output error, or return None for others.
 
-    Return None for other errors. A full or broken disk is reported.
+    A full or broken disk is reported.
 
     Returns:
         The exit code, or None if the error doesn't concern standard output.

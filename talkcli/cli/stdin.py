@@ -57,11 +57,11 @@ class InputTooLong(UsageError):
     """Raised if standard input is longer than a text may be."""
 
 
-def read_text(end: float | None, *, stop_without_reader: bool = False, any_length: bool = False) -> str | int:
+def read_text(deadline: float | None, *, stop_without_reader: bool = False, any_length: bool = False) -> str | int:
     """Return all of standard input as one text, or an exit code if interrupted.
 
     Args:
-        end: the monotonic time by which the input must have ended, or None for no limit.
+        deadline: the monotonic time by which the input must have ended, or None for no limit.
         stop_without_reader: whether to stop if the reader of standard output goes away.
         any_length: whether to read a text of any length.
 
@@ -75,7 +75,7 @@ def read_text(end: float | None, *, stop_without_reader: bool = False, any_lengt
     data = bytearray()
     with Interrupts(output=stop_without_reader) as interrupts:
         while any_length or len(data) <= MAX_TEXT_BYTES + len("\r\n"):
-            if not wait_ready({0: select.POLLIN}, seconds_left(end), interrupts.watched):
+            if not wait_ready({0: select.POLLIN}, seconds_left(deadline), interrupts.watched):
                 raise TimedOut("standard input did not end in time; nothing was sent")
             more = _read_available()
             if more == b"":

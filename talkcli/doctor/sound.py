@@ -343,7 +343,7 @@ def suspended_sinks(env: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def find_sound_server(env: Mapping[str, str], session: UserSession) -> SoundServer:
-    """Find the sound server that the session's players connect to."""
+    """Return facts about the sound server that the session's players connect to."""
     pulse = run_program("pactl", "info", env=env)
     if pulse.error is None:
         fields = dict(re.findall(r"^\s*([\w ]+): (.*\S)", pulse.stdout, re.MULTILINE))
@@ -483,7 +483,7 @@ def _describe_player_setting(set_by_server: bool) -> str:
 
 
 def check_player(env: Mapping[str, str], configured: str | None, used: str | None, *, by_server: bool) -> Finding:
-    """Check whether the player is installed, and return the finding.
+    """Check whether the player of the server or the doctor is installed, and return the finding.
 
     Args:
         env: the environment of the player.
