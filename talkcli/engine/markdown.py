@@ -59,10 +59,11 @@ _LINE = re.compile(
     r"|(?P<block>(?P<fence>`{3,}(?=[^`\n]*(?:\n|\Z))|~{3,})[^\n]*)|(?P<row>\|[ \t]*)|(?P<item>(?:\[\^[^\]\s]{1,50}\]:"
     r"|(?:[-*+•]|(?P<number>\d{1,3})[.)])(?=[ \t\n]|\Z)(?:[ \t]+\[[ xX]\](?=[ \t\n]))?)[ \t]*)|(?P<paragraph>))"
 )
-#: Matches an incomplete line if more text decides which marks it begins with.
+#: Matches an incomplete line if more text decides which marks it begins with. No two neighbouring repetitions match the
+#: same characters, so the time is proportional to the length of the line.
 _PARTIAL_LINE = re.compile(
-    r"(?:[ \t>]*(?:[-*+•=_#|:`~ \t]{0,500}|\d{0,3}[.)]?)(?:[ \t]+\[?[ xX]?\]?)?|[ \t>]*(?:`{3,}|~{3,})[^`\n]{0,500}"
-    r"|[ \t>]*\[[^\]\n]{0,200}(?:\](?::[^\n]{0,500})?)?)\Z"
+    r"[ \t>]*(?![ \t>])(?:[-*+•=_#|:`~ \t]{0,500}(?:(?<=[ \t])\[?[ xX]?\]?)?|\d{1,3}(?:[.)](?:[ \t]+\[?[ xX]?\]?)?)?"
+    r"|(?:`{3,}|~{3,}(?!~))[^`\n]{0,500}|\[[^\]\n]{0,200}(?:\](?::[^\n]{0,500})?)?)\Z"
 )
 #: The end of a paragraph, after which no mark in it can be closed.
 _PARAGRAPH_END = re.compile(r"\n[ \t]*(?:\n|[-*+•#][ \t]|\||```|\d{1,3}[.)][ \t])")

@@ -54,27 +54,8 @@ CASES = {
     "😀 ![](x.png)": "",
 }
 MARKS = ["*", "**", "_", "`", "```", "~~", "[", "](a)", "!", "![", "<b>", "<", "|", "#", "# ", "- ", "1. ", "> ", "\\"]
-PIECES = [
-    *MARKS,
-    "\n",
-    "\n\n",
-    " ",
-    "a",
-    "Word",
-    "é",
-    "3",
-    ".",
-    ":",
-    "(",
-    ")",
-    "]",
-    "---",
-    "😀",
-    "\u200d",
-    "\ufe0f",
-    "https://a_b",
-]
-TEXTS = st.lists(st.sampled_from(PIECES), max_size=40).map("".join)
+PIECES = [*MARKS, "\n", "\n\n", " ", "a", "Word", "é", "3", ".", ":", "(", ")", "]", "---", "😀", "\u200d", "\ufe0f"]
+TEXTS = st.lists(st.sampled_from([*PIECES, "https://a_b"]), max_size=40).map("".join)
 
 
 @pytest.mark.parametrize("text", CASES)
@@ -129,10 +110,12 @@ def test_text_is_held_back_only_until_its_marks_are_known(text: str, known: str)
 
 @pytest.mark.parametrize(
     "block",
-    ["plain text. ", "**a** *b* [c](d) `e`\n- f\n\n", "*a ", "[a](b ", "[", "`a ", "<a ", "| a ", "```\nx\n", "> "],
+    ["plain text. ", "**a** *b* `e`\n- f\n\n", "*a ", "[a](b ", "[", "`a ", "<a ", "| a ", "```\nx\n", "> ", " "],
 )
 def test_a_long_text_takes_linear_time(block: str) -> None:
-    text = (block * 50_000)[:50_000]
-    began = time.process_time()
-    blank_markdown(text)
+    text = "\n" + (block * 50_000)[:50_000] + "b"
+    reader, began = MarkdownReader(), time.process_time()
+    for at in range(0, len(text), 1_000):
+        reader.read(text[at : at + 1_000])
+    reader.read("", ended=True)
     assert time.process_time() - began < 0.6, "it usually takes less than 0.2 s"
