@@ -22,7 +22,7 @@ import pytest
 from talkcli import install
 from talkcli.engine import protocol
 from talkcli.install import NEURAL_PACKAGES
-from tests.engine.process import SOON, Engine, SharedEngine, before_call
+from tests.engine.process import FAST, SOON, Engine, SharedEngine, before_call
 from tests.engine.programs import Player, without_silence
 from tests.support import tiny_voice
 from tests.support.espeak import RATE
@@ -182,6 +182,11 @@ def test_unknown_phonemes_are_left_out_and_a_text_without_others_fails(folder: P
     assert times == sorted(times)
     message = _failure_message(engine.spoken("See! " * 12, "g2", voice="piper/few"))
     assert "few.onnx.json has no id for a phoneme of the text (" in message
+    engine.send(protocol.Speak("g4", text, FAST, 1.0, "piper/few", 50, voice_only=True, more=True))
+    engine.until(protocol.TextMissing)
+    engine.send(protocol.Append("g4", "", end=True))
+    assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
+    assert _words(engine, text, "g4") == ["Cat", "Cat"]
 
 
 # -- without the extra
@@ -275,6 +280,17 @@ def test_espeak_speaks_if_a_neural_voice_fails_at_once(folder: Path, engine: Eng
         assert reason is not None
         assert str(folder / "wrong.onnx") in reason
         assert _words(engine, TEXT, goal) == TEXT.replace(",", "").split()
+
+
+def test_a_growing_text_keeps_the_voice_with_which_it_began(folder: Path, engine: Engine) -> None:
+    tiny_voice.put(folder, "slow", config=tiny_voice.description(rate=16000))
+    engine.send(protocol.Speak("g1", "One. ", FAST, 1.0, "piper/slow", 50, more=True))
+    assert [engine.until(protocol.TextMissing).missing for _ in range(2)] == [True, False]
+    engine.send(protocol.LoadVoice("piper/slow"))
+    assert engine.until(protocol.VoiceLoaded).error is None
+    engine.send(protocol.Append("g1", "Two.", end=True))
+    assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
+    assert _chosen_voices(engine, "g1") == [("gmw/en-US", "piper/slow is not loaded")]
 
 
 def test_speech_continues_if_there_is_no_memory_for_a_model(real_voice_env: dict[str, str], tmp_path: Path) -> None:

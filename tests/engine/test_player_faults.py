@@ -100,6 +100,16 @@ def test_a_failing_player_fails_the_sentence_with_a_readable_message(
     assert re.fullmatch(message, actual_message or ""), actual_message
 
 
+def test_a_player_that_ends_too_early_fails_a_sentence_that_had_to_wait_for_its_text(player: Player) -> None:
+    with Engine(player.command(SWALLOWS), alive_every=SOON) as engine:
+        engine.send(protocol.Speak("g1", "One. ", FAST, 1.0, None, 50, more=True))
+        assert [engine.until(protocol.TextMissing).missing for _ in range(3)] == [True, False, True]
+        for _ in range(10):  # longer than the rest of the text
+            engine.until(protocol.Alive)
+        engine.send(protocol.Append("g1", "battery low, please come home", end=True))
+        assert engine.until(protocol.Ended).reason == "audio_lost"
+
+
 def test_a_player_that_hangs_after_the_sound_fails_the_sentence(player: Player) -> None:
     reason, message = _failure(player.plays(after="time.sleep(100)"), DRAIN_LIMIT_S=0.3)
     assert (reason, message) == ("audio_stalled", "player did not exit within 0.3 s after the sound")

@@ -156,7 +156,8 @@ class PlayerFeed:
         self.progress_at = time.monotonic()
         self._rate = rate
         self._clock = clock
-        self._first_write_at = 0.0
+        #: time at which the stream began, moved by the time in which the player had nothing to play
+        self._began_at = 0.0
         #: time at which everything written will have been heard
         self._heard_at = 0.0
         #: bytes of silence to write before the first sample
@@ -172,7 +173,7 @@ class PlayerFeed:
         if taken:
             now = time.monotonic()
             if self.written == 0:
-                self._first_write_at = now
+                self._began_at = now
                 self._clock.start(now)
             self.written += taken
             self.progress_at = now
@@ -228,7 +229,11 @@ class PlayerFeed:
 
     def missing_seconds(self, now: float) -> float:
         """Return how many seconds of audio would be lost if the player ended now."""
-        return self._first_write_at + self._seconds(self.written) - now
+        return self._began_at + self._seconds(self.written) - now
+
+    def add_delay(self, seconds: float) -> None:
+        """Record that the player had nothing to play for some time, because the text was missing."""
+        self._began_at += seconds
 
     def _seconds(self, byte_count: int) -> float:
         """Return the duration of this many bytes of samples."""
@@ -305,8 +310,6 @@ class Playback:
             fallback_reason: human-readable reason for a fallback voice, or None for the requested voice.
         """
         if self._feed is not None and rate != self._rate:
-            if self._part_begin:
-                raise CannotSpeak(Reason.ENGINE_FAILED, "the rest of the text would need another sample rate")
             self._replace_player(0)  # the player was started with a different sample rate
         self._rate = rate
         self._runner.report_voice(voice, fallback_reason)
@@ -588,11 +591,11 @@ class Playback:
         with self._samples.part(self._sent, min(self._sendable_end(feed), self._sent + feed.piece_bytes)) as part:
             silent = feed.silent_for(time.monotonic())
             taken = feed.offer(part)
-        if taken:
-            late = self._in_background and feed.player.real_time and not self._text_was_missing
+        if taken and self._text_was_missing:
             self._text_was_missing = False
-            if late and silent > INAUDIBLE_GAP_S:
-                self.gaps.append(silent)
+            feed.add_delay(silent)
+        elif taken and self._in_background and feed.player.real_time and silent > INAUDIBLE_GAP_S:
+            self.gaps.append(silent)
         self._sent += taken
         return taken
 

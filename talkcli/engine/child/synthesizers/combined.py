@@ -33,6 +33,8 @@ class CombinedSynthesizer:
         self._current: Synthesizer = self._espeak
         self.version = self._espeak.version
         self.voice = self._espeak.voice
+        #: why libespeak-ng speaks the current text instead of the neural voice, or None
+        self._fallback_reason: str | None = None
 
     def voices(self) -> tuple[Voice, ...]:
         """Return all voices of libespeak-ng, and then all installed neural voices."""
@@ -47,14 +49,16 @@ class CombinedSynthesizer:
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
         """Speak a text with the current voice, or with libespeak-ng if a neural voice fails.
 
-        The error is raised instead if `settings.voice_only` is set, or if samples have already been written.
+        The error is raised instead if `settings.voice_only` is set, or if samples have already been written. The voice
+        never changes between two parts of a text.
         """
         neural = self._neural
         if neural is None or self._current is not neural or settings.voice_only:
             self._current.speak(text, settings, sink)
             return
-        why = neural.problem
-        if why is None:
+        if settings.begins_text:
+            self._fallback_reason = neural.problem
+        if self._fallback_reason is None:
             try:
                 neural.speak(text, replace(settings, pitch=SpeechSettings().pitch), sink)
                 return
@@ -63,14 +67,14 @@ class CombinedSynthesizer:
             except CannotSpeak as error:
                 if error.reason != Reason.VOICE_FAILED or neural.has_written:
                     raise
-                why = str(error)
+                self._fallback_reason = str(error)
             except Exception as error:
                 if neural.has_written:
                     raise
                 traceback.print_exc()  # Log the bug, and let the other synthesizer speak instead.
-                why = f"{neural.voice} failed: {type(error).__name__}: {error}"
+                self._fallback_reason = f"{neural.voice} failed: {type(error).__name__}: {error}"
         self._espeak.load_language(neural.language)
-        self._espeak.speak(text, settings, sink, why)
+        self._espeak.speak(text, settings, sink, self._fallback_reason)
 
     @property
     def loader(self) -> ModelLoader | None:

@@ -76,7 +76,7 @@ class Piper:
         self._espeak = espeak
         self.loader = ModelLoader()
         self.voice = ""
-        #: whether the last sentence has produced any sound
+        #: whether the last text has produced any sound
         self.has_written = False
         #: the id of the current voice without the speaker, the speaker, and the path of the model
         self._model_id, self._speaker, self._path = "", "", ""
@@ -130,7 +130,7 @@ class Piper:
         if settings.pitch != _DEFAULT_PITCH:
             words = f"the pitch of {self.voice} can't be changed; leave out --pitch, or choose an espeak voice"
             raise CannotSpeak(Reason.BAD_OPTION, words)
-        self.has_written = False
+        self.has_written = self.has_written and not settings.begins_text
         voice = self._model_id
         model = self._wait_for_model(voice, sink)
         description = model.description
@@ -197,10 +197,10 @@ def _speak_parts(
     """Synthesize the parts of a text, and yield small pieces of sound with their words.
 
     Raises:
-        VoiceFileError: The model is faulty, or doesn't know any of the phonemes.
+        VoiceFileError: The model is faulty, or knows none of the phonemes with which the text begins.
     """
     pause = int(_PAUSE_S * model.description.rate)
-    cut_silence, first, unknown = settings.begins_text, True, ""
+    first, unknown = True, ""
     for part in parts:
         ids, places = _phoneme_ids(part.phonemes, model.description.phoneme_ids)
         if not places:
@@ -223,7 +223,7 @@ def _speak_parts(
             loudest = max(loudest, float(levels.max()))
             audible = (levels > _PAUSE_LEVEL).nonzero()[0]
             quiet = len(samples) - 1 - int(audible[-1]) if len(audible) else quiet + len(samples)
-            if first and cut_silence:
+            if first and settings.begins_text:
                 samples, words = _cut_leading_silence(samples, levels, words, model.description.rate)
             first = False
             silent.append((_to_bytes(samples, settings.volume), words))
@@ -235,7 +235,7 @@ def _speak_parts(
             raise VoiceFileError(f"{model.path} produced no sound for a text; download the voice again")
         if part.ends_sentence and quiet < pause:
             yield bytes((pause - quiet) * SAMPLE_BYTES), ()
-    if unknown and first:
+    if unknown and first and settings.begins_text:  # the voice can speak other parts
         why = f"has no id for a phoneme of the text ({unknown[:20]})"
         raise VoiceFileError(f"{model.path}.json {why}; download both files from the same source")
 
