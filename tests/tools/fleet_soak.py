@@ -1,4 +1,4 @@
-"""Soak test of a robot with a broker: random goals, and a fault every few seconds.
+"""Soak test of a robot with a broker: random goals and growing texts, and a fault every few seconds.
 
     python -m tests.tools.fleet_soak --seconds 1800 [--seed N] [--every SECONDS]
 

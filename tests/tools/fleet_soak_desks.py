@@ -31,13 +31,14 @@ RATE = 450
 UNSENT, REFUSED = "UNSENT", "REFUSED"
 UNSPOKEN = frozenset({UNSENT, REFUSED, "REJECTED", "RECALLED"})
 _END_BY_EXIT_CODE = {0: "SUCCEEDED", 3: UNSENT, 4: "ABORTED", 5: "REJECTED", 6: "RECALLED", 7: "PREEMPTED", 12: "LOST"}
-#: Time until a desk that found no robot tries again.
-_RETRY_S = 0.3
+#: Time until a desk that found no robot tries again, and time between two pieces of a growing text.
+_RETRY_S, _INTERVAL_S = 0.3, 0.2
 _OPTIONS: tuple[dict[str, Any], ...] = (
     *({},) * 10,
     *({"preempt": True}, {"preempt": True, "priority": 2}, {"flush": True, "priority": -1}),
     *({"priority": -1, "ttl": 3.0}, {"preempt": True, "ttl": 0.2}, {"preempt": True, "ttl": 0.5}),
     *({"preempt": True, "ttl": 1.0}, {"ttl": 2.0}, {"ttl": 8.0}, {"key": "one"}, {"patient": True}, {"feedback": True}),
+    *({"stall": 1.0}, {"stall": 5.0}, {"stall": 5.0, "preempt": True}, {"stall": 60.0, "ttl": 8.0}),  # growing texts
 )
 _COMMAND_OPTIONS: tuple[tuple[str, ...], ...] = ((), (), ("--preempt",), ("--priority", "1"), ("--feedback",))
 
@@ -139,7 +140,14 @@ class Desks:
 
     def _send(self, client: Client, goal: Sent, options: dict[str, Any]) -> tuple[Sent, GoalHandle] | None:
         try:
-            return goal, client.say(goal.text, id=goal.id, rate=RATE, **options)
+            if "stall" not in options:
+                return goal, client.say(goal.text, id=goal.id, rate=RATE, **options)
+            with client.stream(id=goal.id, rate=RATE, **options) as speech:
+                for text in (goal.text, ". Then ", "go on, ", "and wait."):
+                    speech.write(text)
+                    time.sleep(_INTERVAL_S)
+            assert speech.goal
+            return goal, speech.goal
         except Lost:
             self._ledger.end(goal, "LOST")
         except ServerUnavailable:

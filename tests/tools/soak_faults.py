@@ -70,9 +70,10 @@ class RobotFaults(FaultInjector):
             "player killed": lambda: self._signal(player, signal.SIGKILL),
             "player frozen": lambda: self._signal(player, signal.SIGSTOP),
             "sink suspended": lambda: self._disturb(sink.suspend, sink.resume, 5),
-            "sink unplugged": lambda: self._disturb(sink.unload, sink.reload, 3),
+            # The clients speak all the time. They warm the sink up, and it is never quiet.
+            "sink unplugged": lambda: self._disturb(sink.unload, lambda: sink.reload(warm=False), 3),
             "sound server frozen": lambda: self._disturb(sink.freeze, sink.thaw, 5),
-            "sound server killed": lambda: self._disturb(sink.kill_server, sink.start_server, 3),
+            "sound server killed": lambda: self._disturb(sink.kill_server, lambda: sink.start_server(warm=False), 3),
             "paused": lambda: self._disturb(self._pause, lambda: self._request("resume"), 2),
             "everything cancelled": lambda: self._request("cancel"),
             "SIGHUPs": self._send_hangups,

@@ -93,13 +93,14 @@ def test_after_an_absence_unfinished_texts_are_claimed_and_additions_are_sent_ag
     stopped = Goal("preempted", State.PREEMPTED)
     robot.on_message(Message("talk/reply/bob/s1/anna", encode(Result(stopped).to_json())))
     unanswered = robot.begin(Append("open", "lo", 3))
+    robot.begin(Say("Hel", more=True, id="begun"))
     robot.on_disconnected("the broker is gone")
     waiting = robot.begin(Append("added", " there", 5, end=True))
     desk.take()
     come_online(robot, "another")
     sent = desk.take()
     lookups = [request for request in sent if isinstance(request, Wait)]
-    assert {each.ids for each in lookups} == {("open",), ("added",), ("ended",)}
+    assert {each.ids for each in lookups} == {("open",), ("added",), ("ended",), ("begun",)}
     additions = [request for request in sent if not isinstance(request, Wait)]
-    assert set(additions[:2]) == {Append("open"), Append("added")}
-    assert additions[2:] == [unanswered.request, waiting.request]
+    assert set(additions[:3]) == {Append("open"), Append("added"), Append("begun")}
+    assert additions[3:] == [unanswered.request, waiting.request]

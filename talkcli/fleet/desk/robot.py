@@ -306,7 +306,8 @@ class RobotConnection(Connection):
             self._send_without_answer(Hello(self._sender))
         if self._canceled:
             self._send_without_answer(Cancel(tuple(self._canceled)))
-        self._growing &= self.listeners.goals.keys()
+        requests = [each.request for each in self.exchanges.values()]
+        self._growing &= {*self.listeners.goals, *(each.id for each in requests if isinstance(each, Say))}
         for goal_id in tuple(self._growing):
             self._send_without_answer(Append(goal_id))  # Otherwise, the text would break off.
         self._lookups.clear()
