@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import pytest
-
+from talkcli.client.core import TrackedGoal
 from talkcli.fleet import topics
 from talkcli.fleet.broker import Broker
 from talkcli.fleet.payloads import Message
+from talkcli.goals.goal import Goal
 from talkcli.goals.options import Append, Say
 from talkcli.goals.states import State
 from talkcli.protocol.events import Result
@@ -33,29 +33,8 @@ class Desk:
         self.sent.append((number, request))
         return True
 
-    def take(self) -> list[Request]:
-        """Return the requests since the last call."""
-        sent, self.sent = self.sent, []
-        return [request for _, request in sent]
-
     def wake(self) -> None:
         pass
-
-
-@pytest.fixture
-def desk() -> Desk:
-    needs_packages("paho")
-    return Desk()
-
-
-@pytest.fixture
-def robot(desk: Desk) -> RobotConnection:
-    """A connection to anna, who is online."""
-    from talkcli.fleet.desk.robot import RobotConnection
-
-    robot = RobotConnection("anna", desk)  # type: ignore[arg-type]
-    come_online(robot)
-    return robot
 
 
 def come_online(robot: RobotConnection, session: str = "5e55") -> None:
@@ -71,20 +50,19 @@ def answer(robot: RobotConnection, desk: Desk, **fields: Any) -> None:
 
 def begin_text(robot: RobotConnection, desk: Desk, goal_id: str) -> None:
     """Send a growing text, and follow its goal."""
-    from talkcli.client.core import TrackedGoal
-    from talkcli.goals.goal import Goal
-
     robot.begin(Say("Hel", more=True, id=goal_id, wait=True))
     answer(robot, desk, goal=Goal(goal_id, State.PENDING).to_json())
     TrackedGoal(Goal(goal_id, State.PENDING))._listen_to(robot.listeners, feedback=False, now=0.0)
 
 
-def test_after_an_absence_unfinished_texts_are_claimed_and_additions_are_sent_again(
-    robot: RobotConnection, desk: Desk
-) -> None:
+def test_after_an_absence_unfinished_texts_are_claimed_and_additions_are_sent_again() -> None:
     """Without the empty additions, the texts would break off if nothing were written for a while."""
-    from talkcli.goals.goal import Goal
+    needs_packages("paho")
+    from talkcli.fleet.desk.robot import RobotConnection
 
+    desk = Desk()
+    robot = RobotConnection("anna", desk)  # type: ignore[arg-type]
+    come_online(robot)
     for goal_id in ("open", "added", "ended", "preempted"):
         begin_text(robot, desk, goal_id)
     for request in (Append("added", "lo", 3), Append("ended", "lo", 3, end=True)):
@@ -96,9 +74,9 @@ def test_after_an_absence_unfinished_texts_are_claimed_and_additions_are_sent_ag
     robot.begin(Say("Hel", more=True, id="begun"))
     robot.on_disconnected("the broker is gone")
     waiting = robot.begin(Append("added", " there", 5, end=True))
-    desk.take()
+    desk.sent.clear()
     come_online(robot, "another")
-    sent = desk.take()
+    sent = [request for _, request in desk.sent]
     lookups = [request for request in sent if isinstance(request, Wait)]
     assert {each.ids for each in lookups} == {("open",), ("added",), ("ended",), ("begun",)}
     additions = [request for request in sent if not isinstance(request, Wait)]
