@@ -76,7 +76,7 @@ class VoiceDescription:
 
 
 def missing_package() -> str | None:
-    """Return an error message if a package for neural voices is missing."""
+    """Return an error message if a package for neural voices is missing, otherwise None."""
     from importlib.util import find_spec
 
     missing = next((each for each in install.NEURAL_PACKAGES if find_spec(each) is None), None)
@@ -334,10 +334,7 @@ def _shorten(value: object) -> str:
 
 
 def _checked_integer(value: object) -> int:
-    """Return the value if it is an integer from 0 to 2,147,483,647.
-
-    Otherwise raise ValueError.
-    """
+    """Return the value if it is an integer from 0 to 2,147,483,647. Otherwise raise ValueError."""
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 31:
         raise ValueError(f"{value!r} is not a valid integer")
     return value

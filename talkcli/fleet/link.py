@@ -250,7 +250,7 @@ class Link:
         return True
 
     def subscribe(self, *topics: str, retained: bool) -> None:
-        """Subscribe to topics.
+        """Subscribe to topics, with or without the messages that the broker has retained.
 
         Args:
             topics: the topics, which may contain wildcards.

@@ -78,7 +78,7 @@ class Presence:
 
 
 def bridge_rank(presence: Presence | None) -> tuple[float, str] | None:
-    """Return a bridge's rank among the bridges with the same robot name.
+    """Return a bridge's rank among those with the same robot name, or None if it is offline.
 
     The bridge with the lowest rank keeps the robot's name. The others exit.
     """

@@ -201,7 +201,7 @@ class GrowingText:
         """
         for found in _SENTENCE_END.finditer(self.text, max(self._position, self._searched)):
             self._searched = found.start()
-            needed = _wait_at_stop(self.text, self._position, found)
+            needed = _required_wait(self.text, self._position, found)
             if needed <= waited:
                 return found.start() if "\n" in found.group() else found.end()
             if needed < _NEVER:
@@ -210,7 +210,7 @@ class GrowingText:
         return None
 
 
-def _wait_at_stop(text: str, start: int, stop: re.Match[str]) -> int:
+def _required_wait(text: str, start: int, stop: re.Match[str]) -> int:
     """Return how long to wait for more text before the sentence may end at this stop.
 
     The sentence begins at `start`. The result is one of the constants such as `_SHORT_WAIT`.
@@ -230,20 +230,20 @@ def _wait_at_stop(text: str, start: int, stop: re.Match[str]) -> int:
     dot = stop.start()
     abbreviation = _ABBREVIATION.search(text[max(start, dot - _ABBREVIATION_CHARS) : dot + 2])
     if abbreviation:
-        return _wait_after_abbreviation(text, following, str(abbreviation.lastgroup))
+        return _required_abbreviation_wait(text, following, str(abbreviation.lastgroup))
     return _NO_WAIT if following < len(text) else _SHORT_WAIT
 
 
-def _wait_after_abbreviation(text: str, following: int, kind: str) -> int:
+def _required_abbreviation_wait(text: str, next_start: int, kind: str) -> int:
     """Return how long to wait for more text before a sentence may end at an abbreviation.
 
-    `following` is the offset of the text after it, and `kind` is the name of its group in `_ABBREVIATION`.
+    `next_start` is the offset of the text after it, and `kind` is the name of its group in `_ABBREVIATION`.
     """
     if kind == "never":
         return _NEVER
-    if _LAST_WORD.match(text, following):
+    if _LAST_WORD.match(text, next_start):
         return _LONG_WAIT
-    return _NEVER if _REST[kind].match(text, following) else _NO_WAIT
+    return _NEVER if _REST[kind].match(text, next_start) else _NO_WAIT
 
 
 def _find_gap(text: str, start: int, limit: int) -> int | None:

@@ -232,10 +232,10 @@ class DriverProperties:
         return found.id
 
     def _set_property(self, name: str, value: Any, label: str) -> None:
-        """Set a property of the engine, or raise CannotSpeak.
+        """Set a property of the engine, or raise CannotSpeak with `label` in its message.
 
-        pyttsx3 reports errors through notifications. This method raises them as exceptions. In the messages,
-        `label` names the property and its value.
+        pyttsx3 reports errors through notifications. This method raises them as exceptions. In the messages, `label`
+        names the property and its value.
 
         Raises:
             CannotSpeak: the property can't be set.

@@ -413,7 +413,7 @@ class GoalRunner:
             self._goal.error = exception
 
     def _handle_driver_finished(self, name: str | None, completed: bool, **_: object) -> None:
-        """End the current goal after the driver has finished its text."""
+        """End the goal after the driver has finished, unless it was stopped for a pause."""
         goal = self._goal
         if goal is None or name != goal.id:  # the notification is for an earlier goal
             return

@@ -258,10 +258,7 @@ class PrivateEngine(contextlib.AbstractContextManager["PrivateEngine"]):
         return next(event for event in self.events if isinstance(event, event_class))
 
     def _receive_events(self) -> Iterator[protocol.Event]:
-        """Yield the events of the process endlessly.
-
-        Raise an error if it fails or a time limit has passed.
-        """
+        """Yield the events of the process, and raise an error if it fails or takes too long."""
         process = self._process
         watched = {process.socket.fileno(): select.POLLIN, process.stderr: select.POLLIN}
         while True:

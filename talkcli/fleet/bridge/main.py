@@ -79,23 +79,24 @@ class BridgeSettings:
     homeassistant: bool = False
 
 
-def run_bridge(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> None:
+def run_bridge(settings: BridgeSettings, read_broker_settings: Callable[[], Broker]) -> None:
     """Run the bridge until SIGTERM or SIGINT.
 
     Args:
         settings: the bridge's settings.
-        read_broker: called before each connection to read the broker's settings, because a password may have changed.
+        read_broker_settings: called before each connection to read the broker's settings, because a password may have
+            changed.
 
     Raises:
         UsageError: a certificate or key file is unusable.
         AddressInUse: an older bridge has the same robot name.
     """
-    asyncio.run(_run_until_signal(settings, read_broker))
+    asyncio.run(_run_until_signal(settings, read_broker_settings))
 
 
-async def _run_until_signal(settings: BridgeSettings, read_broker: Callable[[], Broker]) -> None:
+async def _run_until_signal(settings: BridgeSettings, read_broker_settings: Callable[[], Broker]) -> None:
     """Run the bridge in the event loop until SIGTERM, SIGINT or an error."""
-    loop, bridge = asyncio.get_running_loop(), Bridge(settings, read_broker)
+    loop, bridge = asyncio.get_running_loop(), Bridge(settings, read_broker_settings)
 
     def on_signal(number: signal.Signals) -> None:
         log.write(f"stopping after {number.name}")
@@ -113,7 +114,7 @@ async def _run_until_signal(settings: BridgeSettings, read_broker: Callable[[], 
 class Bridge:
     """Connects one robot to the broker. All methods run in the event loop's thread."""
 
-    def __init__(self, settings: BridgeSettings, read_broker: Callable[[], Broker]) -> None:
+    def __init__(self, settings: BridgeSettings, read_broker_settings: Callable[[], Broker]) -> None:
         """Create a bridge that isn't connected yet.
 
         The arguments are those of `run_bridge`.
@@ -121,7 +122,7 @@ class Bridge:
         self._settings = settings
         self._echo_topic = topics.robot(settings.name, topics.ECHO)
         self._presence_topic = topics.robot(settings.name, topics.PRESENCE)
-        self._broker, self._read_broker = read_broker(), read_broker
+        self._broker, self._read_broker_settings = read_broker_settings(), read_broker_settings
         self._loop = asyncio.get_running_loop()
         self._session, self._since = f"{random.getrandbits(64):016x}", time.time()
         groups = tuple(dict.fromkeys((topics.ALL_ROBOTS, *settings.groups)))
@@ -159,9 +160,9 @@ class Bridge:
         self._error: BaseException | None = None
 
     async def run(self) -> None:
-        """Keep the robot connected until `end` is called.
+        """Keep the robot connected until `end` is called, and then take it offline.
 
-        Then take it offline, and raise the error given to `end`.
+        At the end, raise the error given to `end`.
         """
         self._broker.ssl_context()  # check the certificate files before anything is started
         log.write(f"starting: robot {self._settings.name}, broker {self._broker.url}")
@@ -220,7 +221,7 @@ class Bridge:
             await asyncio.sleep(random.uniform(0, self._retry_s))
             self._retry_s = min(_LAST_BROKER_RETRY_S, self._retry_s * 2)
             try:
-                self._broker = self._read_broker()
+                self._broker = self._read_broker_settings()
             except TalkError as error:
                 log.write_limited("settings", f"{log.sanitize(str(error))}; the previous settings are used")
 

@@ -234,7 +234,7 @@ class DeskLink:
             self.poll(left)
 
     def close(self, *, forked: bool = False) -> None:
-        """Close the connection for good, or only the copies of the descriptors in a forked child.
+        """Close the connection for good, or only a forked child's copies of its descriptors.
 
         Args:
             forked: whether this is a forked child process.

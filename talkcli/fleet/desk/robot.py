@@ -410,7 +410,7 @@ class RobotConnection(Connection):
         self._desk.wake()
 
     def _drop(self) -> None:
-        """Close the connection to the broker, or only the copies in a forked child."""
+        """Close the connection to the broker, or only a forked child's copies of its descriptors."""
         self._desk.close(forked=os.getpid() != self._process)
 
 

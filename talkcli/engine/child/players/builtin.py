@@ -34,7 +34,7 @@ _MAX_WAV_BYTES = _UNKNOWN_BYTES - _WAV_HEADER.size
 
 
 class BuiltInPlayer(Player):
-    """Base class of players that process samples at once."""
+    """Base class of players that process samples immediately."""
 
     proven = True
 
@@ -248,7 +248,7 @@ def _header_fields(rate: int, sample_bytes: int) -> tuple[bytes | int, ...]:
 
 
 def _read_sample_bytes(file: int, path: str, rate: int) -> int:
-    """Read the number of sample bytes from a file's WAV header.
+    """Check the WAV header of a file, and return its number of sample bytes.
 
     Raises:
         CannotSpeak: The file wasn't written by a `WavPlayer` with this sample rate.

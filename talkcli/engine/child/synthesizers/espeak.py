@@ -193,9 +193,10 @@ class Espeak:
         self.voice = voice
 
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink, fallback_reason: str | None = None) -> None:
-        """Synthesize a sentence. The samples vary slightly from call to call.
+        """Synthesize a sentence, and write it to the sink.
 
-        If another voice was requested, `fallback_reason` is a message saying why it is not used.
+        The samples vary slightly from call to call. If another voice was requested, `fallback_reason` is a message
+        saying why it is not used.
         """
         self._stop_phonemizer()
         sink.begin(self._rate, self.voice, fallback_reason)

@@ -123,7 +123,7 @@ class Piper:
         self.voice, self._model_id, self._speaker, self._path = voice, model, speaker, path
 
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
-        """Wait until the voice is loaded, and synthesize a sentence.
+        """Load the voice if necessary, synthesize a sentence, and write it to the sink.
 
         The samples vary from call to call, unless the description of the voice sets its noise to 0.
         """
@@ -172,7 +172,7 @@ class Piper:
         return model
 
     def _write_sound(self, parts: Iterator[SpokenPart], rate: int, run: ModelRun, sink: SampleSink) -> None:
-        """Write the sound of a text to the sink, while a background thread synthesizes the following parts."""
+        """Write sound to the sink, while a thread synthesizes the following parts of the text."""
         write_bytes = int(_WRITE_S * rate) * SAMPLE_BYTES
         seconds = 0.0
         spoken_parts = BackgroundIterator(parts, _MAX_PARTS_AHEAD)

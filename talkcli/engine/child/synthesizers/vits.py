@@ -130,7 +130,7 @@ class _Reader:
 
 
 class _Node:
-    """An operation in a graph. Its inputs include those of nested graphs."""
+    """An operation in a model's graph. Its inputs include those of nested graphs."""
 
     def __init__(self, reader: _Reader, raw: Buffer, depth: int) -> None:
         fields = reader.fields(raw)
@@ -152,7 +152,7 @@ class _Node:
 
 
 class _Graph:
-    """A graph of operations, with its weights."""
+    """A model's graph of operations, with its weights."""
 
     def __init__(self, reader: _Reader, raw: Buffer, depth: int = 0) -> None:
         if depth > _MAX_NESTED_GRAPHS:
