@@ -123,11 +123,11 @@ def test_ctrl_c_cancels_the_goal(talk: Talk) -> None:
 
 def test_a_goal_is_cancelled_after_the_timeout(talk: Talk) -> None:
     for text, details in (("", ": nothing was sent"), ("One. ", "")):
-        typing = Typing(talk, "say", "--stream", "-w", "-t", "1")
+        typing = Typing(talk, "say", "--stream", "-w", "-t", "0.5")
         typing.type(text)
         code, err = typing.client.wait(20), typing.errors.read()
         assert code == 124
-        assert err.splitlines()[-1] == f"talk: timed out after 1 s{details}"
+        assert err.splitlines()[-1] == f"talk: timed out after 0.5 s{details}"
         typing.client.stdin.close()  # type: ignore[union-attr]
     assert [talk.goal(each)["state"] for each in talk.watcher.goals()] == ["PREEMPTED"]
 
@@ -190,11 +190,11 @@ def test_options_that_cannot_be_combined_are_refused(words: list[str], message: 
 
 
 def test_a_terminal_shows_the_text_as_it_grows(talk: Talk) -> None:
-    code = "import sys, time\nfor text in sys.argv[1:]: print(end=text, flush=True); time.sleep(0.7)"
+    code = "import sys, time\nfor text in sys.argv[1:]: print(end=text, flush=True), time.sleep(0.4)"
     line = f'{sys.executable} -c "$CODE" "Hello. " "How are " "you?" | {" ".join(TALK)} say --stream -wf'
     terminal = Terminal(["bash", "-c", line], {**talk.env, "CODE": code}, 80)
     try:
-        terminal.wait_until(lambda screen: "WAITING    Hello. " in screen.last)
+        terminal.wait_until(lambda screen: "WAITING    Hello." in screen.last)
         assert terminal.finish() == 0
         assert terminal.screen.lines[-2].endswith("  SUCCEEDED  Hello. How are you?")
     finally:

@@ -91,12 +91,9 @@ def test_row_30_a_text_is_spoken_and_never_executed(
     make_talk: MakeTalk, sink: Sink, tmp_path: pathlib.Path, voice: Voice, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     texts = [
-        "$(touch x)",
-        "`touch x`",
-        "low; touch x | touch x & touch y",
-        "it's \"touch x\" '; touch x; '",
-        "one\ntouch x\ntwo",
-        "hello \U0001f600 %s %n \\n",
+        "$(touch x) `touch x`",
+        "it's \"a\" '; touch x; ' | touch x & touch y",
+        "one\ntouch x\nlow \U0001f600 %s \\n",
         "-5",
     ]
     monkeypatch.chdir(tmp_path)  # server and clients run in this directory
@@ -206,13 +203,10 @@ def _assert_aborted(talk: Talk, reason: str, *texts: str) -> Finished:
 MEDIAN, WORST = 0.03, 0.1
 #: Minimum correlation of a sentence that came through a tunnel. Measured: 0.985, and 0.1 for another sentence.
 ALIKE = 0.95
-#: Thirty words. It starts with a short silence, see `hearing`.
-THIRTY = (
-    "coming home to the charger in the kitchen, because the battery of this robot is low; "
-    "please bring the small red box from the table to me and then wait"
-)
-#: The words of THIRTY that are reported. libespeak-ng speaks "in the", "of the" and "from the" as one word.
-REPORTED_WORDS = re.sub(r"\b(in|from|of) the\b", r"\1", re.sub("[,;]", "", THIRTY)).split()
+#: Fifteen words. It starts with a short silence, see `hearing`.
+FIFTEEN = "coming home to the charger in the kitchen, because my battery is low; please then wait"
+#: The words of FIFTEEN that are reported. libespeak-ng speaks "in the" as one word.
+REPORTED_WORDS = re.sub("[,;]| the(?= kitchen)", "", FIFTEEN).split()
 #: Ten words with characters of one to four bytes. libespeak-ng speaks "from the" and "this one" as one word, and
 #: reports 東京 several times.
 TEN = "coming from the café 東京 is 😀 naïve, this one"
@@ -279,8 +273,8 @@ def position(reference: Rendering, start: int) -> float:
 def test_word_events_arrive_as_the_words_are_heard(make_talk: MakeTalk, sink: Sink, player: str, rate: int) -> None:
     with limits():
         talk = make_talk("--rate", str(rate), "--player", player, sink=sink)
-        measured = measure(talk, THIRTY, rate)
-        assert [THIRTY[word["start"] : word["end"]] for word in measured.words] == REPORTED_WORDS
+        measured = measure(talk, FIFTEEN, rate)
+        assert [FIFTEEN[word["start"] : word["end"]] for word in measured.words] == REPORTED_WORDS
         measured.assert_in_time()
 
 
@@ -290,10 +284,10 @@ def test_word_events_of_a_neural_voice_arrive_as_the_words_are_heard(
     make_talk: MakeTalk, sink: Sink, joe: Joe, rate: int
 ) -> None:
     with limits():
-        measured = measure(joe.serve(make_talk, sink, rate=rate), THIRTY, rate, voice=joe)
-        assert [THIRTY[word["start"] : word["end"]] for word in measured.words] == REPORTED_WORDS
+        measured = measure(joe.serve(make_talk, sink, rate=rate), FIFTEEN, rate, voice=joe)
+        assert [FIFTEEN[word["start"] : word["end"]] for word in measured.words] == REPORTED_WORDS
         # The reported place of a word in the sound doesn't depend on the load of the machine.
-        reference = joe.render_with_words(Sentence(THIRTY, rate))
+        reference = joe.render_with_words(Sentence(FIFTEEN, rate))
         errors = [abs(word["time"] - position(reference, word["start"])) for word in measured.words]
         assert statistics.median(errors) <= MEDIAN, errors
         assert max(errors) <= WORST, errors
@@ -304,12 +298,12 @@ def test_word_events_wait_for_an_output_with_high_latency(make_talk: MakeTalk, s
     """With the engine's own clock, the events would come 200 ms too early."""
     with limits(), DistantSink(sink) as distant:
         talk = make_talk("--rate", "350", sink=sink, env=distant.env)
-        measure(talk, THIRTY, 350, exact=False).assert_in_time()
+        measure(talk, FIFTEEN, 350, exact=False).assert_in_time()
 
 
 def test_row_42_words_of_any_script_are_reported_once_with_their_place(make_talk: MakeTalk, sink: Sink) -> None:
     with limits():
-        measured = measure(make_talk(sink=sink), TEN, 200)
+        measured = measure(make_talk("--rate", "350", sink=sink), TEN, 350)
         _assert_ten(measured.words)
         assert measured.words[0]["time"] == 0
         measured.assert_in_time()

@@ -70,13 +70,16 @@ def test_a_file_gets_the_same_samples(tmp_path: Path) -> None:
     assert lengths[0] == pytest.approx(lengths[1], abs=22050 * 0.03)
 
 
-def test_words_have_their_places_in_the_whole_text(engine: Engine) -> None:
-    whole = engine.spoken(TEXT)
-    words = [(word.start, word.end, word.number) for word in engine.words()]
-    grow(engine, TEXT, "g2")
-    ended = engine.until(protocol.Ended)
-    assert [(word.start, word.end, word.number) for word in engine.words("g2")] == words
-    assert [word.time for word in engine.words("g2")] == pytest.approx([word.time for word in engine.words()], abs=0.03)
+def test_words_have_their_places_in_the_whole_text(tmp_path: Path) -> None:
+    with Engine(f"file:{tmp_path / 'out.wav'}") as engine:
+        whole = engine.spoken(TEXT)
+        grow(engine, TEXT, "g2")
+        ended = engine.until(protocol.Ended)
+        words, grown = engine.words(), engine.words("g2")
+    assert [(word.start, word.end, word.number) for word in grown] == [
+        (word.start, word.end, word.number) for word in words
+    ]
+    assert [word.time for word in grown] == pytest.approx([word.time for word in words], abs=0.03)
     assert ended.duration == pytest.approx(whole.duration, abs=0.03)
 
 

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 TEXT = "battery low, please come home"
 VOICE = "piper/tiny"
 #: Code for the start of the process that makes loading slow, as on a slow machine.
-SLOW_TO_LOAD = before_call("synthesizers.inference:Model._set_halves", "time.sleep(0.8)")
+SLOW_TO_LOAD = before_call("synthesizers.inference:Model._set_halves", "time.sleep(0.4)")
 #: Code that makes all samples of a sentence late, except the first piece.
 SLOW_TO_SPEAK = before_call("synthesizers.inference:Model.decode", "time.sleep(0.8 if arguments[2] else 0)")
 #: Code that hides packages.
@@ -353,21 +353,20 @@ def test_a_sentence_ends_once_with_little_memory_and_espeak_speaks_next(tmp_path
 @limits()
 def test_a_sentence_can_be_paused_and_stopped_while_its_voice_loads(folder: Path) -> None:
     with _engine(folder, before=SLOW_TO_LOAD, alive_every=SOON) as engine:
-        engine.say(TEXT, voice=VOICE)
+        engine.say("yes", voice=VOICE)
         engine.until(protocol.Alive)
         assert_within(engine.pause(), protocol.STOP_LIMIT_S, "a pause while the voice is loaded")
-        resume_at = time.monotonic() + 1.2  # after the voice has been loaded
-        while time.monotonic() < resume_at:
-            assert isinstance(engine.event(), protocol.Alive | protocol.VoiceMemory | protocol.VoiceLoaded)
+        while not isinstance(event := engine.event(), protocol.VoiceLoaded):
+            assert isinstance(event, protocol.Alive | protocol.VoiceMemory)
+        assert isinstance(engine.event(), protocol.Alive)
         engine.resume()
         assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
         engine.send(protocol.DropVoice(VOICE))
         engine.say(TEXT, "g2", voice=VOICE)
-        for _ in range(3):
-            engine.until(protocol.Alive)
+        engine.until(protocol.Alive)
         assert_within(engine.stop("g2"), protocol.STOP_LIMIT_S, "a stop while the voice is loaded")
         assert engine.spoken("espeak", "g3").outcome == protocol.OUTCOME_COMPLETED
-        assert engine.spoken(TEXT, "g4", voice=VOICE).outcome == protocol.OUTCOME_COMPLETED
+        assert engine.spoken("yes", "g4", voice=VOICE).outcome == protocol.OUTCOME_COMPLETED
 
 
 @limits()
@@ -408,24 +407,24 @@ def test_a_real_voice_can_be_paused_and_stopped_and_exits_cleanly(real_voice_env
 
 def test_a_program_gets_every_sample_once_and_silence_during_a_pause(folder: Path, player: Player) -> None:
 
-    text = "one two three four five six"
-    with _engine(folder, player.plays()) as engine:
+    text = "one two three"
+    with _engine(folder, player.plays(), alive_every=SOON) as engine:
         ended = engine.spoken(text, "g0", voice=VOICE)
         sentence = player.heard.read_bytes()
         assert ended.duration is not None
         assert len(sentence) == round(ended.duration * 22050) * 2
         player.heard.unlink()
         engine.say(text, "g1", voice=VOICE)
-        engine.until_word(3)
+        engine.until_word(2)
         assert engine.pause() < 0.2
         assert children(engine.process.pid), "the player has ended"
-        for _ in range(2):
+        for _ in range(5):
             engine.until(protocol.Alive)
         engine.resume()
         ended = engine.until(protocol.Ended)
         assert ended.outcome == protocol.OUTCOME_COMPLETED
-        assert ended.gap_seconds < protocol.ALIVE_INTERVAL_S, "the pause was counted as a gap"
-        assert [word.number for word in engine.words()] == [*range(1, 7)]
+        assert ended.gap_seconds < 5 * SOON, "the pause was counted as a gap"
+        assert [word.number for word in engine.words()] == [1, 2, 3]
         heard = player.heard.read_bytes()
         assert len(heard) > len(sentence)
         assert without_silence(heard, sentence) == sentence
@@ -437,7 +436,7 @@ def test_a_program_gets_every_sample_once_and_silence_during_a_pause(folder: Pat
 @pytest.mark.parametrize("player", ["pulse", "aplay"])
 def test_gaps_are_counted_and_words_are_reported_when_heard(folder: Path, sink: Sink, player: str) -> None:
     """A machine that is too slow leaves nothing out, and reports the words in order, however late."""
-    text = "one two three four five six seven"
+    text = "one two three"
     with sink.record() as recording, _engine(folder, player, sink.env, before=SLOW_TO_SPEAK) as engine:
         engine.say(text, voice=VOICE)
         reported = []
@@ -465,7 +464,7 @@ def test_gaps_are_counted_and_words_are_reported_when_heard(folder: Path, sink: 
 @pytest.mark.parametrize("player", [pytest.param("null", marks=pytest.mark.slow), "pulse"])
 def test_a_process_that_is_slowed_speaks_with_gaps(real_voice_env: dict[str, str], sink: Sink, player: str) -> None:
     """The process and its built-in player are stopped for 0.16 s again and again, as under a CPU limit."""
-    text = "Please step aside, the robot turns."
+    text = "Please step aside."
     with Engine(player, environment={**real_voice_env, **sink.env}) as engine:
         assert engine.spoken("a", "g0", voice=REAL_VOICE).gaps == 0
         with _slowed(engine, running=0.04, stopped=0.16):
@@ -474,7 +473,7 @@ def test_a_process_that_is_slowed_speaks_with_gaps(real_voice_env: dict[str, str
             took = time.monotonic() - started_at
         assert ended.outcome == protocol.OUTCOME_COMPLETED
         assert ended.duration is not None
-        assert _words(engine, text) == text.replace(",", "").rstrip(".").split()
+        assert _words(engine, text) == text.rstrip(".").split()
         assert ended.gaps > 2
         assert 0.5 < ended.gap_seconds < took - ended.duration + engine.words()[0].time
         assert engine.spoken("espeak", "g2").outcome == protocol.OUTCOME_COMPLETED
@@ -522,12 +521,12 @@ def test_the_word_times_of_a_real_voice_match_its_sound(real_voice_env: dict[str
 
 def test_voices_are_loaded_one_at_a_time_during_speech_and_reported_once(folder: Path) -> None:
     path = "synthesizers.inference:Model._set_halves"
-    slow = before_call(path, "seen and sys.exit('two at once') or seen.append(1) or time.sleep(0.3) or seen.clear()")
+    slow = before_call(path, "seen and sys.exit('two at once') or seen.append(1) or time.sleep(0.1) or seen.clear()")
     tiny_voice.put(folder, "second")
     with _engine(folder, before=slow) as engine:
         for voice in ("piper/second", VOICE, "piper/second", "piper/nobody", VOICE):
             engine.send(protocol.LoadVoice(voice))
-        assert engine.spoken(TEXT, voice="en", rate=150).outcome == protocol.OUTCOME_COMPLETED
+        assert engine.spoken(TEXT, voice="en", rate=300).outcome == protocol.OUTCOME_COMPLETED
         loaded = [engine.until(protocol.VoiceLoaded) for _ in range(3 - len(_loaded(engine)))]
         assert len(loaded) < 3, "no voice was loaded during the speech"
     assert [(event.voice, event.error) for event in _loaded(engine)] == [
@@ -537,11 +536,11 @@ def test_voices_are_loaded_one_at_a_time_during_speech_and_reported_once(folder:
     ]
 
 
-def test_espeak_speaks_the_language_of_a_voice_that_is_not_loaded(folder: Path) -> None:
+def test_espeak_speaks_the_language_of_a_voice_that_is_not_loaded(folder: Path, tmp_path: Path) -> None:
     tiny_voice.put(folder, "deutsch", config=tiny_voice.description(voice="de"))
     tiny_voice.put(folder, "second")
     _create_wrong_voice(folder, "silent")
-    with _engine(folder) as engine:
+    with _engine(folder, f"file:{tmp_path / 'out.wav'}") as engine:
         for voice, fallback in [(VOICE, "gmw/en-US"), ("piper/deutsch", "gmw/de"), ("piper/wrong", "gmw/en-US")]:
             assert engine.spoken(TEXT, voice, voice=voice, voice_only=False).outcome == protocol.OUTCOME_COMPLETED
             assert _chosen_voices(engine, voice) == [(fallback, f"{voice} is not loaded")]

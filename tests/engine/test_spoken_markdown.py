@@ -25,8 +25,9 @@ WORDS = ["Battery", "Low", "at", "nine", "See", "the", "charger", "Now"]
 
 
 @pytest.fixture(scope="module")
-def shared() -> Iterator[SharedEngine]:
-    with contextlib.closing(SharedEngine(Engine)) as shared:
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SharedEngine]:
+    target = tmp_path_factory.mktemp("markdown") / "out.wav"  # a file is faster than real time
+    with contextlib.closing(SharedEngine(lambda: Engine(f"file:{target}"))) as shared:
         yield shared
 
 
@@ -72,8 +73,8 @@ def test_an_incomplete_link_of_a_broken_text_is_not_spoken(engine: Engine) -> No
     assert heard(engine, "".join(text)) == ["One", "Two"]
 
 
-def test_a_neural_voice_does_not_speak_marks(real_voice_env: dict[str, str]) -> None:
-    with Engine(environment=real_voice_env) as engine:
+def test_a_neural_voice_does_not_speak_marks(real_voice_env: dict[str, str], tmp_path: Path) -> None:
+    with Engine(f"file:{tmp_path / 'out.wav'}", environment=real_voice_env) as engine:
         speak(engine, TEXT, voice=REAL_VOICE)
         assert heard(engine, TEXT) == WORDS
 

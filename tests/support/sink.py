@@ -203,7 +203,15 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
         return clean_environment(self.directory, self.env)
 
     def _warm_up(self) -> None:
-        """Play a tone until it is heard and the monitor sends small blocks steadily. Then wait for silence."""
+        """Play a tone until it is heard and the monitor sends small blocks steadily. Then wait for silence.
+
+        The sink has already begun a block of two seconds, which it drops when it is suspended.
+        """
+        end = time.monotonic() + _LIMIT_S
+        while not self.pactl("list", "short", "source-outputs"):
+            assert time.monotonic() < end, f"the monitor is not connected within {_LIMIT_S} s"
+        self.suspend()
+        self.resume()
         tone = f"{self.directory}/tone"
         wave = 3000 * np.sin(np.arange(int(_WARM_UP * RATE)) * (2 * np.pi * 441 / RATE))
         with open(tone, "wb") as file:
