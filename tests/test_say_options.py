@@ -34,7 +34,7 @@ def busy(talk: Talk) -> str:
 
 
 def test_markdown_is_spoken_without_its_marks(make_talk: MakeTalk, tmp_path: Path) -> None:
-    talk, text = make_talk("--player", "null"), "**Battery** [low](http://a.b/c)"
+    talk, text = make_talk("--player", "null", "--rate", "450"), "**Battery** [low](http://a.b/c)"
     plain = talk.goal(talk.run("say", "--wait", "Battery low").id)
     done = talk.run("say", "--feedback", "--markdown", text)
     goal = talk.goal(done.out.split()[0])
