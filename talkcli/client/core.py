@@ -130,6 +130,11 @@ class EventListeners:
         """The ids of the followed goals, and whether each needs words."""
         return {goal_id: any(each._with_feedback for each in some) for goal_id, some in self._goals.items()}
 
+    @property
+    def growing(self) -> list[str]:
+        """The ids of the followed goals to which this client adds text."""
+        return [goal_id for goal_id, some in self._goals.items() if any(each._adds_text for each in some)]
+
     def lose(self, goal_id: str, why: str) -> None:
         """End a followed goal as LOST, and stop following it.
 
@@ -187,6 +192,8 @@ class TrackedGoal:
         self.attached = False
         #: whether all speech is paused, as far as the client knows
         self.speech_paused = False
+        #: whether this client still adds text to the goal
+        self._adds_text = False
         #: monotonic time since which the server has sent the goal's events, or None
         self._followed_at: float | None = None
         #: whether to buffer words and pauses, too
@@ -204,6 +211,7 @@ class TrackedGoal:
         self.goal = Goal.from_json(reply.get("goal"))
         self.attached = reply.get("attached") is True
         self.speech_paused = reply.get("paused") is True
+        self._adds_text = self.goal.more
 
     def _listen_to(self, listeners: EventListeners, *, feedback: bool, now: float) -> None:
         """Register for the goal's events, which the server sends from now on."""
@@ -213,12 +221,14 @@ class TrackedGoal:
         if not self.goal.state.terminal:
             listeners.add(self)
 
-    def _grow(self, text: str) -> None:
+    def _grow(self, addition: Append) -> None:
         """Add text that the server has accepted, unless the goal has ended.
 
-        The Result has the whole text.
+        After reconnecting, the goal may already have this text. The Result has the whole text.
         """
-        self._update(replace(self.goal, text=(self.goal.text or "") + text))
+        self._adds_text = not addition.end
+        text = (self.goal.text or "")[: addition.at] + addition.text
+        self._update(replace(self.goal, text=text, more=self._adds_text))
 
     def _fail(self, error: TalkError) -> None:
         """End the goal as LOST or REJECTED after a failed `say` request."""
@@ -725,8 +735,8 @@ class ClientCore:
     def connected(self, server: ServerInfo, now: float) -> None:
         """Record the greeting after reconnecting, and follow all goals again or end them.
 
-        The goals are followed again if the server wasn't restarted in the meantime. Otherwise they are LOST. Watches
-        and waiting requests are sent again.
+        The goals are followed again if the server wasn't restarted in the meantime. Otherwise they are LOST. Their
+        texts continue over this connection. Watches and waiting requests are sent again.
 
         Args:
             server: the server's greeting. Each start of the server has another boot id.
@@ -738,6 +748,8 @@ class ClientCore:
         if restarted:
             self._lose_goals()
         waiting, self._unsent = self._unsent, deque()
+        for goal_id in self.listeners.growing:
+            self._begin(Exchange(Append(goal_id)), now)  # otherwise, the text would break off
         for goal_id, feedback in self.listeners.goals.items():
             self._follow_again(goal_id, feedback=feedback, now=now)
         if self.listeners.watches:

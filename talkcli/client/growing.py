@@ -45,15 +45,15 @@ class TextSender:
         self._open = self._open or self._create_request()
         return self._open
 
-    def accepted(self, goal_id: str) -> str:
-        """Record that the server has accepted the unanswered request, and return its text."""
+    def accepted(self, goal_id: str) -> Say | Append:
+        """Record that the server has accepted the unanswered request, and return it."""
         request = self._open
         assert request
         self.refused()
         self._goal_id = goal_id
         self._length += len(request.text)
         self.finished = request.end if isinstance(request, Append) else not request.more
-        return request.text
+        return request
 
     def refused(self) -> None:
         """Forget the unanswered request and its text, which is not sent again."""

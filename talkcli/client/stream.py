@@ -131,7 +131,9 @@ class SpeechStream:
     def _add_text(self, *_: object) -> None:
         """Add text to the goal that the server has accepted."""
         assert self.goal
-        self.goal._grow(self._text.accepted(self.goal.id))
+        addition = self._text.accepted(self.goal.id)
+        assert isinstance(addition, Append)
+        self.goal._grow(addition)
 
     def _process_error(self, error: TalkError) -> None:
         """Record that the goal takes no more text, unless the error only concerns the last text.

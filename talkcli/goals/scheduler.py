@@ -289,6 +289,8 @@ class Scheduler:
         added = addition.text[len(known) :]
         if record.state not in {State.PENDING, State.ACTIVE}:
             raise RequestRefused(f"goal {record.id} has ended ({record.state})", "goal_ended")
+        if record.broken:
+            raise RequestRefused(f"goal {record.id} takes no more text: {_BROKEN_OFF}", "goal_ended")
         if at > len(text):
             words = f"the text of goal {record.id} has {len(text):,} characters, so nothing can be added at {at:,}"
             raise RequestRefused(words, "text_missing")
@@ -301,7 +303,7 @@ class Scheduler:
         if refused := options.bad_characters(added, self.max_text * options.GROWTH_FACTOR, len(text)):
             raise RequestRefused(refused[1], refused[0])
         self._stop_awaiting_sender(record)
-        record.say, record.more = replace(record.say, text=text + added), not addition.end
+        record.say, record.more = replace(record.say, text=text + added), addition.broken or not addition.end
         self._reset_stall_limit(record, now)
         if addition.broken:
             return self.break_off(record, now, at_once=True)

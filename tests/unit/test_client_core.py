@@ -420,6 +420,20 @@ def test_goals_are_followed_again_after_reconnecting_to_the_same_server(reconnec
     assert tracked.goal.state is State.SUCCEEDED
 
 
+def test_an_incomplete_text_is_claimed_after_reconnecting_and_grows_once(reconnecting: ClientCore) -> None:
+    tracked = say(reconnecting)
+    send_all(reconnecting)
+    receive(reconnecting, {"seq": 1, "ok": True, "goal": {**goal(), "more": True}})
+    tracked._grow(Append("g", "b", 1))
+    reconnecting.disconnected("it is gone", 1.0)
+    greet(reconnecting)
+    claim, wait = send_all(reconnecting)
+    assert (claim, wait["request"]) == ({"seq": 2, "request": "append", "id": "g"}, "wait")
+    receive(reconnecting, {"seq": 3, "goal": {**goal(), "text": "abc", "more": True}}, {"seq": 3, "ok": True})
+    tracked._grow(Append("g", "c", 2, end=True))  # the answer to the first attempt was lost
+    assert (tracked.goal.text, tracked.goal.more, reconnecting.listeners.growing) == ("abc", False, [])
+
+
 def test_goals_are_lost_if_the_server_was_restarted(reconnecting: ClientCore) -> None:
     tracked = say(reconnecting)
     send_all(reconnecting)
@@ -609,10 +623,8 @@ def test_a_watch_gets_added_text(core: ClientCore) -> None:
     receive(core, {"event": "text", "id": "g", "start": 1, "text": "b", "n": 1})
     receive(core, {"event": "waits", "id": "g", "waits": False, "n": 2})
     assert list(iter(watching.take, None)) == [TextAdded("g", 1, "b", n=1), TextMissing("g", waits=False, n=2)]
-    tracked._grow("b")
-    assert tracked.goal.text == "ab"
     receive(core, {"event": "result", "goal": goal("SUCCEEDED")})
-    tracked._grow("c")  # the reply came after the result, which has the whole text
+    tracked._grow(Append("g", "c", 1))  # the reply came after the result, which has the whole text
     assert tracked.goal.text == "a"
 
 

@@ -19,6 +19,7 @@ from tests.support.surroundings import needs_packages
 
 if TYPE_CHECKING:
     from talkcli.fleet.desk.robot import RobotConnection
+    from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
 
 
@@ -48,11 +49,15 @@ def answer(robot: RobotConnection, desk: Desk, **fields: Any) -> None:
     robot.on_message(Message("talk/reply/bob/s1/anna", encode({"seq": desk.sent[-1][0], "ok": True, **fields})))
 
 
-def begin_text(robot: RobotConnection, desk: Desk, goal_id: str) -> None:
+def begin_text(robot: RobotConnection, desk: Desk, goal_id: str) -> TrackedGoal:
     """Send a growing text, and follow its goal."""
     robot.begin(Say("Hel", more=True, id=goal_id, wait=True))
-    answer(robot, desk, goal=Goal(goal_id, State.PENDING).to_json())
-    TrackedGoal(Goal(goal_id, State.PENDING))._listen_to(robot.listeners, feedback=False, now=0.0)
+    reply: JsonObject = {"goal": Goal(goal_id, State.PENDING, more=True).to_json()}
+    answer(robot, desk, **reply)
+    tracked = TrackedGoal(Goal("", State.PENDING))
+    tracked._accept(reply)
+    tracked._listen_to(robot.listeners, feedback=False, now=0.0)
+    return tracked
 
 
 def test_after_an_absence_unfinished_texts_are_claimed_and_additions_are_sent_again() -> None:
@@ -63,11 +68,11 @@ def test_after_an_absence_unfinished_texts_are_claimed_and_additions_are_sent_ag
     desk = Desk()
     robot = RobotConnection("anna", desk)  # type: ignore[arg-type]
     come_online(robot)
-    for goal_id in ("open", "added", "ended", "preempted"):
-        begin_text(robot, desk, goal_id)
+    texts = {each: begin_text(robot, desk, each) for each in ("open", "added", "ended", "preempted")}
     for request in (Append("added", "lo", 3), Append("ended", "lo", 3, end=True)):
         robot.begin(request)
         answer(robot, desk, length=5, state="ACTIVE")
+        texts[request.id]._grow(request)
     stopped = Goal("preempted", State.PREEMPTED)
     robot.on_message(Message("talk/reply/bob/s1/anna", encode(Result(stopped).to_json())))
     unanswered = robot.begin(Append("open", "lo", 3))

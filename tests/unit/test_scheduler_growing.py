@@ -60,7 +60,7 @@ can be cancelled meanwhile
     a; b more id=x stall=2; left b; cancel b; wait 9 -> a ACTIVE; b RECALLED canceled by door
 # a sender that gives up
 stops the goal at once
-    a more; append a text=b broken; stopped a -> a ABORTED broken_off
+    a more; append a text=b end broken; stopped a -> a ABORTED broken_off
 takes a waiting goal out of the queue
     a; b more; append b broken -> a ACTIVE; b RECALLED broken_off
 doesn't bring back a goal that is cancelled first
@@ -83,6 +83,7 @@ def test_a_rule_holds(script: str, outcome: str) -> None:
     [
         ("a more; completed a", {"text": "b"}, "goal_ended"),
         ("a more; cancel a", {"text": "b"}, "goal_ended"),
+        ("a more; left a", {"text": "b"}, "goal_ended"),
         ("a", {"text": "b"}, "text_ended"),
         ("a more; append a end", {"text": "b"}, "text_ended"),
         ("a more", {"text": "b", "at": 2}, "text_missing"),

@@ -122,8 +122,6 @@ class RobotConnection(Connection):
         self._absence_error: type[ServerUnavailable] = ServerUnavailable
         #: the ids of canceled goals, which are canceled again after each absence
         self._canceled: set[str] = set()
-        #: the ids of the goals whose texts this connection has begun, but not ended
-        self._growing: set[str] = set()
         #: queued lookups of goals, which are sent when earlier ones have been answered
         self._lookups: deque[Exchange] = deque()
 
@@ -175,9 +173,6 @@ class RobotConnection(Connection):
             return False
         self._published_at = time.monotonic()
         exchange.sent = True
-        if isinstance(request := exchange.request, Say | Append):
-            grows = request.more if isinstance(request, Say) else not (request.end or request.broken)
-            (self._growing.add if grows else self._growing.discard)(str(request.id))
         return True
 
     def answer_deadline(self, exchange: Exchange) -> float:
@@ -306,9 +301,9 @@ class RobotConnection(Connection):
             self._send_without_answer(Hello(self._sender))
         if self._canceled:
             self._send_without_answer(Cancel(tuple(self._canceled)))
-        requests = [each.request for each in self.exchanges.values()]
-        self._growing &= {*self.listeners.goals, *(each.id for each in requests if isinstance(each, Say))}
-        for goal_id in tuple(self._growing):
+        begun = [each.request for each in self.exchanges.values() if each.sent]
+        begun_ids = [str(each.id) for each in begun if isinstance(each, Say) and each.more]
+        for goal_id in self.listeners.growing + begun_ids:
             self._send_without_answer(Append(goal_id))  # Otherwise, the text would break off.
         self._lookups.clear()
         interrupted = [each for each in self.exchanges.values() if isinstance(each, RobotExchange)]
