@@ -127,7 +127,7 @@ def test_a_refused_text_is_rejected_at_the_beginning_and_raises_later(client: Cl
     assert ended(speech)[:2] == (State.REJECTED, "invalid_text")
     with client.stream() as speech:
         assert speech.write("One. ")
-        with pytest.raises(RequestRefused, match="half of a surrogate pair") as caught:
+        with pytest.raises(RequestRefused, match="character 6 is half of a surrogate pair") as caught:
             speech.write("\ude00")
         assert caught.value.code == "invalid_text"
         assert speech.write("Two.")

@@ -37,7 +37,7 @@ ALL_EXIT_CODES: ExitCodes = {
     1: "any other error; if it is a bug in talk, TALK_DEBUG=1 prints a traceback",
     2: "wrong usage",
     3: "no server, no broker, or the robot is offline; nothing was spoken, so you can try again",
-    4: "aborted: the engine or the sound failed, or the text can't be spoken",
+    4: "aborted: the engine or the sound failed, or the text is incomplete or can't be spoken",
     5: "rejected: the goal was never queued (bad text, full queue, too many clients)",
     6: "recalled: the goal was removed from the queue before it was spoken",
     7: "preempted: the goal was stopped while it was being spoken",

@@ -224,7 +224,7 @@ _ROWS = (
         exit_codes={
             0: "accepted, or skipped by --throttle; with --wait: played to the end",
             3: "no server; nothing was spoken, so you can try again",
-            4: "aborted: the engine or the sound failed, or the text can't be spoken",
+            4: "aborted: the engine or the sound failed, or the text is incomplete or can't be spoken",
             5: "rejected: never queued (bad text, full queue, too many clients)",
             6: "recalled: removed from the queue before it was spoken",
             7: "preempted: stopped while it was being spoken",

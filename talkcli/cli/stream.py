@@ -13,7 +13,7 @@ from talkcli.cli.command import is_bad_byte, replace_bad_bytes
 from talkcli.cli.show import retry_without_output, show_if_possible
 from talkcli.cli.stdin import InputSpeaker
 from talkcli.cli.wait import seconds_left, timeout_error
-from talkcli.errors import EXIT_OK, TalkError
+from talkcli.errors import EXIT_OK, RequestRefused, TalkError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import Say
 from talkcli.goals.states import State
@@ -91,7 +91,6 @@ class StreamSpeaker(InputSpeaker):
 
         Raises:
             TimeoutError: the goal has not ended in time.
-            RequestRefused: the server refused a part of the text.
             Interrupted: a signal or closed output ends the wait.
         """
         exchange: Exchange | None = None  # the request that has not been answered
@@ -128,12 +127,16 @@ class StreamSpeaker(InputSpeaker):
     def _process_answer(self, exchange: Exchange) -> None:
         """Process the answer to a request to add text.
 
-        Raises RequestRefused if the server refused only this text.
+        If the server refused only this text, report that, and stop the goal.
         """
         try:
             self._connection.answer(exchange)
         except TalkError as error:
-            self._speech._process_error(error)
+            try:
+                self._speech._process_error(error)
+            except RequestRefused:
+                self._feedback.note(error.message)
+                self._speech._break_off()
 
     def _show_events(self, goal: GoalHandle) -> None:
         """Show the goal's new events with --wait. Otherwise, forget them."""

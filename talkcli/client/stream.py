@@ -82,8 +82,7 @@ class SpeechStream:
             self._text.ended = True
             self._send()
         elif self.goal and not self._stopped:
-            with suppress(TalkError):
-                self._connection.request(Append(self.goal.id, broken=True))
+            self._break_off()
 
     # -- internal
 
@@ -134,6 +133,12 @@ class SpeechStream:
         addition = self._text.accepted(self.goal.id)
         assert isinstance(addition, Append)
         self.goal._grow(addition)
+
+    def _break_off(self) -> None:
+        """Stop the goal, because its text will never be complete."""
+        assert self.goal
+        with suppress(TalkError):
+            self._connection.request(Append(self.goal.id, broken=True))
 
     def _process_error(self, error: TalkError) -> None:
         """Record that the goal takes no more text, unless the error only concerns the last text.

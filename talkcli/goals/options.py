@@ -750,12 +750,13 @@ def bad_characters(text: str, max_chars: int | None, before_chars: int = 0) -> R
     try:
         size = len(text.encode())
     except UnicodeEncodeError as error:
-        words = f"the text is not valid Unicode: character {error.start + 1} is half of a surrogate pair"
+        words = f"the text is not valid Unicode: character {before_chars + error.start + 1} is half of a surrogate pair"
         return Reason.INVALID_TEXT, words
     if max_chars is not None and size > MAX_TEXT_BYTES:
         return Reason.TEXT_TOO_LONG, f"the text is too long: {size:,} bytes (at most {MAX_TEXT_BYTES:,})"
     if "\0" in text:
-        return Reason.INVALID_TEXT, f"the text contains a NUL character (character {text.index(chr(0)) + 1})"
+        place = before_chars + text.index("\0") + 1
+        return Reason.INVALID_TEXT, f"the text contains a NUL character (character {place:,})"
     return None
 
 

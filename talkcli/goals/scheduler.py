@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from talkcli.goals.options import Append, Cancel, Say, Set
 
-_BROKEN_OFF = "the sender left before the text ended"
+_BROKEN_OFF = "the text broke off before its end"
 #: Time limit for the engine to become silent after a stop. Every cancel must be answered within 2 s.
 CONFIRM_SILENCE_S = 1.9
 

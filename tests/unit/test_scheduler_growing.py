@@ -125,7 +125,7 @@ def test_what_was_heard_of_a_broken_text_is_not_the_whole_text() -> None:
     robot = play("a more; append a text=bcdef; heard a; left a; completed a")
     goal = robot.goals["a"].snapshot()
     assert (goal.text, goal.spoken, goal.spoken_end) == ("abcdef", "abcd", 4)
-    assert goal.message == "speech failed: the sender left before the text ended"
+    assert goal.message == "speech failed: the text broke off before its end"
 
 
 def test_a_text_that_breaks_off_before_its_first_sentence_is_complete_is_broken_off() -> None:
