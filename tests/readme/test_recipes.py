@@ -47,19 +47,12 @@ def test_a_robot_drives_only_if_the_goal_was_spoken(scripted: Talk, scripted_she
     assert "no server" in scripted_shell.run(script, "moving off").stdout
 
 
-@runs("Growing texts: In the library")
-def test_a_growing_text(speaking: Talk) -> None:
-    code = block("Growing texts: In the library") + "print(goal.state, goal.text)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=speaking.env, check=False)
-    assert (done.stdout, done.stderr) == ("SUCCEEDED Hello. How are you?\n", "")
-
-
-@runs("Recipes: Battery guard")
+@runs("More recipes: Battery guard")
 def test_the_battery_guard_warns_once_and_stops(scripted: Talk, scripted_shell: Shell) -> None:
     battery = scripted_shell.directory / "capacity"
     for charge in ("80", "19", "18", "4"):
         battery.write_text(f"{charge}\n", encoding="utf-8")
-        done = scripted_shell.run(block("Recipes: Battery guard"), BATTERY=str(battery))
+        done = scripted_shell.run(block("More recipes: Battery guard"), BATTERY=str(battery))
         assert (done.returncode, done.stdout, done.stderr) == (0, "", ""), done  # the goal at 18 is throttled
     assert texts_of(scripted)[:1] == ["battery at 19 percent"]
     assert [text for text in texts_of(scripted) if "stop" in text] == ["battery at 4 percent, I have to stop"]

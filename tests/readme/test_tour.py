@@ -27,7 +27,8 @@ def without_servers(name: str, talk: Talk) -> str:
 
 @runs("talk", "Say something", "Wait for the result", "Say something: Interrupt", "Choose a voice")
 def test_goals_are_spoken_awaited_and_preempted(speaking: Talk, shell: Shell) -> None:
-    shell.program("date", "echo Thursday")
+    for program, text in (("date", "Thursday"), ("llm", "at your service")):
+        shell.program(program, f"echo {text}")
     for program in ("move_arm", "close_door"):
         shell.stand_in(program)
     for name in ("talk", "Say something", "Wait for the result", "Say something: Interrupt", "Choose a voice"):
@@ -36,7 +37,7 @@ def test_goals_are_spoken_awaited_and_preempted(speaking: Talk, shell: Shell) ->
     assert (len(shell.calls("move_arm")), len(shell.calls("close_door"))) == (1, 1)
     texts = speaking.watcher.texts("PENDING")
     assert texts[:5] == ["battery low", "stop", "moving to the charger", "-5 degrees", "Thursday"]
-    assert texts[5:7] == ["please step back", "the door is closing"]
+    assert texts[5:8] == ["at your service", "please step back", "the door is closing"]
     speaking.watcher.wait_until(lambda _: "emergency stop" in speaking.watcher.texts("SUCCEEDED"))
     (door,) = [goal for goal in map(speaking.goal, speaking.watcher.goals()) if goal["text"].endswith("at the door")]
     assert door["priority"] == 10

@@ -1,0 +1,121 @@
+"""The examples on the page about talking with people, with a server that plays nothing in real time."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from tests.readme.blocks import block, runs
+from tests.support.surroundings import needs
+
+if TYPE_CHECKING:
+    from tests.conftest import MakeTalk
+    from tests.readme.shell import Shell
+    from tests.support.processes import Talk
+
+#: The model prints its prompt, lets the person interrupt before the first word of the second answer, and can fail.
+_CHANGES = {
+    "    for word": "    print(history)\n    while len(history) == 3 > len(said): time.sleep(0.01)\n    for word",
+    "        yield": '        assert said[-1] != "fail" or word != "9", "no model"\n        yield',
+}
+
+
+@pytest.fixture
+def speaking(make_talk: MakeTalk) -> Talk:
+    """A server without sound, whose engine is ready."""
+    talk = make_talk("--player", "null", "--rate", "450")
+    assert talk.run("voices").code == 0
+    return talk
+
+
+def wait_for_word(talk: Talk, answer: str) -> str:
+    """Wait for the fifth word of an answer, and return the goal's id."""
+    event = talk.watcher.wait_until(
+        lambda event: event.get("number") == 5 and talk.goal(event["id"])["text"].startswith(answer)
+    )
+    return str(event["id"])
+
+
+@runs("In Python")
+def test_the_history_of_a_dialogue_contains_what_was_heard(speaking: Talk) -> None:
+    talk = speaking
+    code = block("In Python")
+    for old, new in _CHANGES.items():
+        assert code.count(old) == 1
+        code = code.replace(old, new)
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    command = [sys.executable, "-uc", code]
+    with ExitStack() as stack:
+        dialogue = stack.enter_context(subprocess.Popen(command, env=talk.env, text=True, bufsize=1, **pipes))
+        stack.callback(dialogue.kill)  # if an assertion fails
+        assert dialogue.stdin
+        assert dialogue.stdout
+
+        def history() -> list[tuple[str, str]]:
+            assert dialogue.stdout
+            return [(each["role"], each["content"]) for each in ast.literal_eval(dialogue.stdout.readline())]
+
+        def heard(goal_id: str) -> list[tuple[str, str]]:
+            goal = talk.goal(goal_id)
+            return [("assistant", goal["text"][: goal["spoken_end"]])] if goal["spoken_end"] else []
+
+        dialogue.stdin.write("hello\n")
+        assert history() == [("user", "hello")]
+        goal_id = wait_for_word(talk, "You said: hello.")
+        dialogue.stdin.write("wait\n")
+        talk.watcher.wait_for(goal_id, "PREEMPTED")
+        first = [("user", "hello"), *heard(goal_id)]
+        assert history() == first
+        words = [word["word"] for word in talk.watcher.words(goal_id)]
+        assert re.findall(r"\w+", first[1][1]) in (words, words[:-1])  # the last word may have been interrupted
+        assert history() == [*first, ("user", "wait")]  # the next prompt
+        dialogue.stdin.write("next\n")
+        assert history() == [*first, ("user", "wait")]  # interrupted before the first word
+        third = [*first, ("user", "wait"), ("user", "next")]
+        assert history() == third
+        goal_id = wait_for_word(talk, "You said: next.")
+        assert talk.run("say", "--preempt", "--", "other").code == 0
+        third += history()[4:]
+        assert third[4:] == heard(goal_id) != []
+        dialogue.stdin.write("fail\n")
+        assert history() == [*third, ("user", "fail")]
+        assert dialogue.stdout.readline() == "the model or the server failed: no model\n"
+        assert history() == [*third, ("user", "fail"), *heard(talk.watcher.goals()[-1])]
+        assert talk.goal(talk.watcher.goals()[-1])["reason"] == "broken_off"
+        assert dialogue.communicate(timeout=20) == ("", None)
+        assert dialogue.returncode == 0
+
+
+@runs("In the shell")
+def test_the_shell_prints_what_was_heard(speaking: Talk, shell: Shell) -> None:
+    needs("jq")
+    shell.program("answer", "exec bash -c '" + block("In the shell").replace("'", "'\\''") + '\' answer "$1"')
+    shell.program("llm", 'echo "You said: $1. One two three."; exit "${code:-0}"')
+    for code in ("0", "3"):
+        done = shell.run("answer hello", code=code)
+        assert (done.returncode, done.stdout) == (int(code), "You said: hello. One two three.\n")
+    shell.program("llm", "while :; do echo one two; done")
+    running = shell.start("answer hello")
+    goal_id = wait_for_word(speaking, "one two")
+    assert speaking.run("cancel", "--key", "dialogue").code == 0
+    out, _ = running.communicate(timeout=20)
+    goal = speaking.goal(goal_id)
+    assert (running.returncode, out) == (7, goal["text"][: goal["spoken_end"]] + "\n")
+
+
+@runs("Was that for me?")
+def test_a_pause_ends_after_the_decision(speaking: Talk, shell: Shell) -> None:
+    for code, state in ((0, "PREEMPTED"), (1, "SUCCEEDED")):
+        shell.program("was-that-for-me", f"talk status > status; exit {code}", directory=shell.directory)
+        goal_id = speaking.request("say", text="one two three four five six", key="dialogue")["goal"]["id"]
+        speaking.watcher.wait_for_word(goal_id)
+        shell.run(block("Was that for me?"))
+        assert speaking.watcher.wait_for_terminal(goal_id) == state
+        assert "speech is paused" in (shell.directory / "status").read_text("utf-8")
+        assert not speaking.request("status")["server"]["paused"]
