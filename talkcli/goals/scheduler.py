@@ -208,6 +208,8 @@ class Scheduler:
         """
         first = self.find(say.id) if say.id is not None and options.is_clients_id(say.id) else None
         if first is not None and first.was_sent_as(say.text):
+            if say.more:
+                self._stop_awaiting_sender(first)
             return first, []
         self._count += 1
         ttl = (self.settings.ttl if say.ttl is None else say.ttl) or None
