@@ -46,7 +46,7 @@ def run(arguments: list[str]) -> int:
 
 
 def _prepare_streams() -> None:
-    """Open closed standard streams as /dev/null, and escape what the locale can't encode.
+    """Open closed standard streams as /dev/null, and escape characters that the locale can't encode.
 
     If file descriptor 0, 1 or 2 stayed closed, the next socket or lock file would get its number, and messages would be
     written to it.

@@ -34,7 +34,7 @@ _PAUSED_TEXT_CHARS = 40
 
 
 def cancel(options: CommonOptions, ids: tuple[str, ...], current: bool, before: str | None, key: str | None) -> None:
-    """Cancel the selected goals, or all goals if none are selected, and print their ids."""
+    """Cancel the selected goals, or all goals if none are selected. Print their ids."""
     with options.connect() as client:
         try:
             done = client.cancel(ids or None, current=current, before=before, key=key)

@@ -230,7 +230,7 @@ class ClickCommand(_HelpfulCommand):
 
 
 class _CommandGroup(_HelpfulCommand, click.Group):
-    """The group of all commands, each created when it is first used."""
+    """The group of all commands. Each command is created when it is first used."""
 
     examples, exit_codes = _EXAMPLES, ALL_EXIT_CODES
 

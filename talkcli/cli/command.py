@@ -85,7 +85,7 @@ class Command:
     exit_codes: ExitCodes | None = None
 
     def usage_fault(self, given: Mapping[str, Any], typed: frozenset[str], common: Mapping[str, Any]) -> str | None:
-        """Return an error message if options are invalid or can't be combined, or None.
+        """Return an error message if options are invalid or can't be combined, otherwise None.
 
         Args:
             given: the values of the command's own options and of its argument, by name.
@@ -127,7 +127,7 @@ class Command:
         return Selection(robot).fault
 
     def run(self, options: CommonOptions, given: Mapping[str, Any]) -> int | None:
-        """Run the command on this machine or on robots, and return its exit code or None."""
+        """Run the command on this machine or on robots. Return its exit code, if any."""
         options.urgent = self.urgent
         function = self.function or f"ask:{self.name}"
         robot = None if self._is_local(given) else named_robot(options.robot, options.socket)
@@ -187,7 +187,7 @@ COMMON_OPTIONS = (
 
 
 def long_flag(option: Option, value: object = None) -> str:
-    """Return an option's long flag, such as --preempt, or its negative one if the value is False."""
+    """Return an option's long flag, such as --preempt, or its negative form if `value` is False."""
     forms = option.flags.split("/")
     return (forms[-1] if value is False else forms[0]).split(", ")[-1]
 
@@ -259,7 +259,7 @@ def _format_byte(character: str) -> str:
 
 
 def replace_bad_bytes(text: str, first_line_number: int = 1) -> tuple[str, str | None]:
-    """Return a text with invalid bytes replaced by U+FFFD, and a message about them or None.
+    """Replace invalid bytes in a text with U+FFFD. Return the text, and a message if there were any.
 
     Args:
         text: the text, with invalid bytes decoded to surrogates.

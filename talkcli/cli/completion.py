@@ -132,9 +132,9 @@ def _with_flag(value: str, incomplete: str) -> str:
 
 
 def _quote_for_bash(value: str, open_quote: str) -> str:
-    """Escape a value for bash, which may follow an unclosed quotation mark.
+    """Escape a value that bash inserts, possibly after an unclosed quotation mark.
 
-    `open_quote` is an unclosed quotation mark before it, or an empty string.
+    `open_quote` is this quotation mark, or an empty string.
     """
     if open_quote == "'":
         return value.replace("'", "'\\''")

@@ -103,7 +103,7 @@ class Interrupts:
         return kind is Interrupted
 
     def handle_error(self, error: Interrupted | OSError) -> None:
-        """Record whether the output's reader is gone, or re-raise an unrelated error.
+        """Record whether the output's reader is gone. Raise the error again if it is unrelated.
 
         If the reader is gone, discard all output. Errors are unrelated if they are neither an interrupt nor a timeout.
         """
@@ -117,7 +117,7 @@ class Interrupts:
             discard_output()
 
     def prepare_cleanup(self) -> None:
-        """Clear the interrupt, so that only a new signal ends the waits of the cleanup."""
+        """Clear the interrupt, so that only a new signal can interrupt the cleanup."""
         if self.signal_number is not None:
             signal.set_wakeup_fd(-1)  # a second SIGHUP must not interrupt the cleanup
         self.watched.pop(STDOUT_FD, None)

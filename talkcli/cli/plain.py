@@ -59,7 +59,7 @@ def read(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand |
 
 
 def _parse(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand | None:
-    """Parse a command line without click, or return None or raise an error if that fails."""
+    """Parse a command line without click. Return None or raise an error if that fails."""
     command: Command | None = None
     words: list[str] = []
     given: dict[str, Any] = {}
@@ -105,7 +105,7 @@ def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, 
 def _build_command(
     command: Command, given: dict[str, Any], words: list[str], environment: Mapping[str, str]
 ) -> PlainCommand | None:
-    """Add defaults, check the options, and return the command, or None if click must parse it."""
+    """Add defaults, and check the options. Return the command, or None if click has to parse it."""
     common = {name: given.pop(name) for name in _COMMON_NAMES & given.keys()}
     typed = frozenset(given)
     for option in command.options:
@@ -124,7 +124,7 @@ def _build_command(
 
 
 def run(parsed: PlainCommand) -> int:
-    """Send a command's request early if possible, run the command, and return its exit code."""
+    """Run a parsed command, and return its exit code. Send its request early if possible."""
     started_at = time.monotonic()
     command, given = parsed.command.name, parsed.given
     blocked: set[int] = set()
@@ -158,7 +158,7 @@ def may_send_early(parsed: PlainCommand) -> bool:
 
 
 def _connect_early(parsed: PlainCommand, before_sending: Callable[[], None]) -> ConnectionAttempt | None:
-    """Connect to the server, send the request if it can be sent early, and return the attempt.
+    """Connect to the server, and send the request if it is simple enough. Return the connection attempt.
 
     Args:
         parsed: the command.

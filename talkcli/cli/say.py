@@ -134,7 +134,7 @@ def _report_sent(goal: GoalHandle, options: CommonOptions, reporter: GoalReporte
 def _write_wav_file(
     path: str, text: str, goal_options: Mapping[str, Any], timeout: float | None, options: CommonOptions
 ) -> int:
-    """Write a text's speech to a file, or to standard output for "-", and return the exit code."""
+    """Write a text's speech to a file, or to standard output for "-". Return the exit code."""
     from talkcli.engine.parent.render import STANDARD_OUTPUT, render
 
     settings, seconds_at_most = _sound_settings(goal_options), seconds_left(options.deadline(timeout))

@@ -159,7 +159,7 @@ class _OutcomePrinter:
 
     def __init__(self, options: CommonOptions, request: Request) -> None:
         self._options, self._request = options, request
-        #: each robot's first failure or, if there is none, its latest outcome. `last` always has its latest value.
+        #: each robot's first failure or, if there is none, its latest outcome. The field `last` is always up to date.
         self._outcomes: dict[str, Outcome] = {}
         shows_count = not options.quiet and sys.stderr is not None and sys.stderr.isatty()
         self._terminal = sys.stderr if shows_count else None
@@ -185,13 +185,13 @@ class _OutcomePrinter:
         An earlier failure is only replaced if it seemed to be final.
         """
         before = self._outcomes.get(outcome.robot)
-        # A robot that answers after such a failure only appeared to be absent, so replace the failure.
+        # A robot that answers after a final failure wasn't absent after all, so replace that failure.
         if before is not None and before.exit_code and not before.last:
             outcome = replace(before, last=outcome.last)
         self._outcomes[outcome.robot] = outcome
 
     def summarize(self, fleet_request: FleetRequest, unfinished_label: str = "not done") -> int:
-        """Print how many robots succeeded and why others failed, and return the exit code.
+        """Print how many robots succeeded and why others failed. Return the exit code.
 
         Args:
             fleet_request: the request.

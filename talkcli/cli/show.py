@@ -180,9 +180,9 @@ def reader_is_gone(error: OSError) -> bool:
 
 
 def handle_output_error(error: Exception) -> int | None:
-    """Discard output and return the exit code after an output error, or return None for others.
+    """Handle a failed write to standard output. Return the exit code, or None for any other error.
 
-    A full or broken disk is reported.
+    Discard all further output. A full or broken disk is reported.
 
     Returns:
         The exit code, or None if the error doesn't concern standard output.
@@ -211,7 +211,7 @@ def _is_read_only(error: OSError) -> bool:
 
 
 def show_if_possible(write: Callable[..., None], *given: object) -> None:
-    """Call a function that writes output, and continue if the disk is full or broken.
+    """Call a function that writes output. Continue if the disk is full or broken.
 
     A full or broken disk is reported.
 
@@ -226,7 +226,7 @@ def show_if_possible(write: Callable[..., None], *given: object) -> None:
 
 
 def retry_without_output(write: Callable[..., _T], *given: Any) -> _T:
-    """Call a function. If nothing reads its output, discard output and call the function again."""
+    """Call a function. If nothing reads its output, discard the output and call the function again."""
     try:
         return write(*given)
     except OSError as error:
@@ -266,7 +266,7 @@ def show_json(message: JsonObject) -> None:
 
 
 def show_result(options: CommonOptions, items: Iterable[JsonObject], lines: Callable[[], Iterable[str]]) -> None:
-    """With --json, print `items` as JSON objects, or else the lines that `lines` returns."""
+    """Print `items` as JSON objects with --json, otherwise the lines that `lines` returns."""
     if options.json:
         for item in items:
             show_json(item)

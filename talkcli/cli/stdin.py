@@ -58,7 +58,7 @@ class InputTooLong(UsageError):
 
 
 def read_text(deadline: float | None, *, stop_without_reader: bool = False, any_length: bool = False) -> str | int:
-    """Return all of standard input as one text, or an exit code if interrupted.
+    """Read all of standard input as one text. Return the text, or an exit code if interrupted.
 
     Args:
         deadline: the monotonic time by which the input must have ended, or None for no limit.
@@ -164,7 +164,7 @@ class LineBuffer:
 
 
 def _read_available() -> bytes | None:
-    """Read what standard input has now. Return b"" at its end, or None if it would block."""
+    """Read the available data from standard input. Return b"" at the end, or None if there is no data yet."""
     try:
         return os.read(0, _STDIN_READ_BYTES)
     except BlockingIOError:  # another program has made standard input non-blocking
@@ -180,7 +180,7 @@ def _decode_text(data: bytes) -> str:
 
 
 class InputSpeaker:
-    """Base class for the commands that speak standard input while it arrives."""
+    """Base class for commands that speak standard input as it arrives."""
 
     def __init__(
         self,
@@ -233,7 +233,7 @@ class InputSpeaker:
         raise NotImplementedError
 
     def _await_input(self, wait: Callable[[], object], *, wants_input: bool) -> bytes | None:
-        """Call a function that waits, and return the input that interrupts it, or None.
+        """Call a blocking function. Return the input that interrupted it, if any.
 
         Args:
             wait: the function.
@@ -442,7 +442,7 @@ class LineSpeaker(InputSpeaker):
             self._failure = line_number, exit_code
 
     def _call_writer(self, write: Callable[..., _T], *given: object) -> _T:
-        """Call a function that writes output. Without --wait, a missing reader is ignored."""
+        """Call a function that writes output. Without --wait, ignore a missing reader."""
         return write(*given) if self._wait else retry_without_output(write, *given)
 
     # Waiting for input and for the server

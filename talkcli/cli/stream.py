@@ -1,4 +1,4 @@
-"""Code for `talk say --stream`, which speaks standard input while it arrives.
+"""`talk say --stream`: speak standard input as it arrives.
 
 One thread reads the input, sends it, and follows the goal. While much of the text has not been heard, the server holds
 back its reply. In this time, no input is read, so the program that writes the input has to wait, too.
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from talkcli.client.client import GoalHandle
     from talkcli.client.core import Exchange
 
-#: Line breaks at the end of the input are not part of the text. This is how many of them are held back until more
-#: text arrives.
+#: The maximum number of line breaks to hold back until more text arrives. Line breaks at the end of the input are not
+#: part of the text.
 _MAX_HELD_LINE_BREAKS = 100
 
 
 class InputDecoder:
-    """Decodes standard input piece by piece into the same text as `talk say -`."""
+    """Decodes standard input as it arrives. The complete text is the same as for `talk say -`."""
 
     def __init__(self) -> None:
         self._decoder = codecs.getincrementaldecoder("utf-8")("surrogateescape")

@@ -92,7 +92,7 @@ class GoalReporter:
         return self.report(goal, prefix)
 
     def report(self, goal: Goal, prefix: str = "") -> int:
-        """Print a goal as JSON, or why it failed, and return its exit code.
+        """Print a goal as JSON, or the reason why it failed. Return its exit code.
 
         The exit code of an unfinished goal is 124. `prefix` is put in front of any message.
         """
@@ -131,7 +131,7 @@ class GoalReporter:
         retry_without_output(self.report, goal.goal)
 
     def wait_for(self, goal: GoalHandle, interrupts: Interrupts, timeout: float | None, follow: Follow) -> int:
-        """Wait until a goal has ended, or cancel it on an interrupt, and return the exit code.
+        """Wait until a goal has ended, or cancel it on an interrupt. Return the exit code.
 
         A timeout also cancels it. If an earlier command has already sent a goal with the same id, that goal
         isn't cancelled.

@@ -240,7 +240,7 @@ class BrokerExamination:
             return failure("bridge", wrong, remedy or step)
 
     def _wait_for(self, function: Callable[[], _Result]) -> _Result:
-        """Run a blocking function in a thread, and return its result or raise TimeoutError.
+        """Run a blocking function in a thread. Return its result, or raise TimeoutError.
 
         Raises:
             TimeoutError: The work takes too long. The thread continues, but its result is ignored.

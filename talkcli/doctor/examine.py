@@ -1,4 +1,4 @@
-"""Run all checks of this machine, in order from the voice to the loudspeaker.
+"""All checks of this machine, in order from the voice to the loudspeaker.
 
 Findings are reported as soon as they are known. The examination never hangs, because every wait has a time limit. It
 changes nothing, and speaks only one sentence.

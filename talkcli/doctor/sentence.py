@@ -142,7 +142,7 @@ def _convert_ended_goal(goal: Goal) -> SentenceResult:
 
 
 def speak_beside_server(client: Client, options: EngineOptions, limit: float) -> SentenceResult:
-    """Speak a silent sentence, and return its result and whether the server spoke meanwhile.
+    """Speak a silent sentence. Return its result, which shows if the server spoke at the same time.
 
     The doctor's own engine speaks the sentence.
     """

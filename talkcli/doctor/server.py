@@ -82,7 +82,7 @@ class SocketPlace:
 
 
 def connect(socket_option: str | None, interrupt: Mapping[int, int] | None) -> tuple[Client | None, Finding]:
-    """Connect to the server, and return the client or None, and the finding about the socket.
+    """Connect to the server. Return the client, if any, and the finding about the socket.
 
     Args:
         socket_option: the value of --socket.
@@ -131,7 +131,7 @@ def _probe_path(path: str, trusted_paths: Container[str | None]) -> SocketPlace:
 
 
 def request_status_and_log(client: Client) -> tuple[JsonObject, list[Goal]]:
-    """Return a server's status, after a short wait for its engine, and its recently ended goals.
+    """Wait briefly for a server's engine to start. Return the server's status and its recently ended goals.
 
     The engine of a server that has just started hasn't reported its player yet.
     """

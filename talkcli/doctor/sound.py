@@ -164,10 +164,10 @@ def file_owner(path: str) -> int | None:
 
 
 def _read_environment(pid: int) -> dict[str, str] | None:
-    """Return the environment of another process, or None if it belongs to another user."""
+    """Return the environment of another process, or None if another user runs the process."""
     data = read_proc_file(f"/proc/{pid}/environ", -1)
     if data is None or file_owner(f"/proc/{pid}") != os.getuid():
-        return None  # root could read it, but can't use another user's sound server
+        return None  # root could read the environment, but can't use another user's sound server
     return dict(each.split("=", 1) for each in os.fsdecode(data).split("\0") if "=" in each)
 
 
@@ -330,7 +330,7 @@ DEVICE_LISTS: dict[str, tuple[str, Callable[[ProgramOutput], Iterable[str]], str
 
 
 def add_pactl_hint(finding: Finding, env: Mapping[str, str]) -> Finding:
-    """Return the finding, with an installation hint if its advice needs pactl but there is none."""
+    """Return the finding. If its advice needs pactl and pactl is missing, add an installation hint."""
     if finding.next is None or "pactl " not in finding.next or on_path("pactl", env):
         return finding
     return replace(finding, next=f"{finding.next} (to install pactl: sudo apt-get install -y {PACKAGES['pacat']})")

@@ -249,7 +249,7 @@ def _check_voice_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
 
 
 def _find_package_fault(env: Mapping[str, str]) -> tuple[str, str] | None:
-    """Return why a package of neural voices can't be imported, and advice; None if all can."""
+    """Return why a package for neural voices can't be imported, and advice. Return None if all can be imported."""
     missing = models.missing_package()
     if missing is not None:
         return _split_advice(missing)
@@ -280,7 +280,10 @@ def _split_advice(message: str) -> tuple[str, str]:
 
 
 def _try_voice(voice: str, options: EngineOptions, limit: float) -> VoiceTrial:
-    """Load a voice, measure how fast it speaks without playing anything, and return the result."""
+    """Load a voice, and measure how fast it synthesizes speech. Return the result.
+
+    Nothing is played.
+    """
     try:
         with open(os.devnull, "wb") as output, start_engine(options, limit, output.fileno()) as engine:
             engine.wait_for(protocol.Ready)
@@ -299,7 +302,7 @@ def _try_voice(voice: str, options: EngineOptions, limit: float) -> VoiceTrial:
 
 
 def _speak(engine: PrivateEngine, voice: str, text: str) -> tuple[protocol.Ended, float | None]:
-    """Speak a text, and return how it ended and the voice's loading time, if it was loaded."""
+    """Speak a text. Return its `Ended` event, and the voice's loading time if the voice was loaded."""
     load_s = None
     # Set `voice_only`, because otherwise espeak would speak if the voice isn't loaded.
     engine.speak(protocol.Speak(text, text, SENTENCE_RATE_WPM, 1.0, voice, 50, voice_only=True))

@@ -87,7 +87,7 @@ class Fleet:
         return Client.over(connect_robot(name, self._broker, name=self._name))
 
     def say(self, to: str, text: str, *, wait: bool = True, ttl: float | None = None, **options: Any) -> FleetRequest:
-        """Speak a text on each robot, and return the request, which yields the outcomes.
+        """Speak a text on each robot. Return the request, which yields the outcomes.
 
         The goal has the same id on all robots. To cancel it, call `cancel` on the returned FleetRequest. After the last
         outcome, call `Fleet.cancel` with the id instead.
@@ -110,34 +110,34 @@ class Fleet:
         before: str | None = None,
         key: str | None = None,
     ) -> FleetRequest:
-        """Cancel goals on each robot, by default all of them, and return the request.
+        """Cancel some or all goals on each robot. Return the request.
 
-        The request yields the outcomes. The other arguments are those of `Client.cancel`. The outcome of a robot
-        arrives when the robot is silent.
+        The request yields the outcomes. By default, all goals are canceled. The other arguments are those of
+        `Client.cancel`. The outcome of a robot arrives when the robot is silent.
         """
         return self._send_request(to, Cancel(None if ids is None else tuple(ids), current, before, key))
 
     def wait(self, to: str, ids: Iterable[str] | None = None) -> FleetRequest:
-        """Return a request that waits for goals on each robot to end, by default all current ones."""
+        """Return a request that waits for the given goals, or for all current goals, on each robot."""
         return self._send_request(to, Wait(None if ids is None else tuple(ids)))
 
     def status(self, to: str) -> FleetRequest:
-        """Request the status of each robot's server, and return the request.
+        """Request the status of each robot's server. Return the request.
 
         The request yields the outcomes. Each outcome contains the status as `said["status"]`.
         """
         return self._send_request(to, Status())
 
     def pause(self, to: str) -> FleetRequest:
-        """Pause speech on each robot until `resume` is called, and return the request."""
+        """Pause speech on each robot until `resume` is called. Return the request."""
         return self._send_request(to, Pause())
 
     def resume(self, to: str) -> FleetRequest:
-        """Resume paused speech on each robot, and return the request."""
+        """Resume paused speech on each robot. Return the request."""
         return self._send_request(to, Resume())
 
     def set(self, to: str, **settings: Any) -> FleetRequest:
-        """Change the settings of each robot's server, and return the request.
+        """Change the settings of each robot's server. Return the request.
 
         The request yields the outcomes. If a robot's bridge doesn't allow this, its outcome is REFUSED. The arguments
         are those of `Client.set`.
@@ -145,7 +145,7 @@ class Fleet:
         return self._send_request(to, Set(**settings))
 
     def _send_request(self, to: str, request: Request) -> FleetRequest:
-        """Send a request to the selected robots, and return it."""
+        """Send a request to the selected robots. Return the FleetRequest."""
         from talkcli.fleet.desk.several import FleetRequest
 
         return FleetRequest(self._broker, Selection(to), request, name=self._name)

@@ -115,7 +115,7 @@ def require_paho() -> None:
 
 
 def client_user(broker: Broker) -> str:
-    """Return the user name for topics: that of the login, or else of the local user.
+    """Return the user name that appears in topics: the login's name, or else the local user's name.
 
     Raises:
         UsageError: the name isn't allowed in a topic.

@@ -1,4 +1,4 @@
-"""Connects to the broker through paho-mqtt, without an event loop or a thread.
+"""A connection to the broker through paho-mqtt, without an event loop or a thread.
 
 The owner polls the connection's descriptor, and calls `read`, `write` and `tick`. A link is never reconnected, because
 paho would resend unacknowledged messages, and the robot might speak an outdated sentence. Create a new link instead.
@@ -369,7 +369,7 @@ class LinkOpener:
     """Opens a link in a thread, because `Link.open` blocks and can't be interrupted."""
 
     def __init__(self, link: Link, on_done: Callable[[], object]) -> None:
-        """Start to open the link in a new thread.
+        """Start opening the link in a new thread.
 
         The thread calls `on_done` when it has finished, unless `cancel` was called before.
         """
@@ -389,7 +389,7 @@ class LinkOpener:
                 self.link.close()
 
     def _open(self) -> None:
-        """Open the link, store any error, and call `on_done` or close a canceled link."""
+        """Open the link, and store any error. Then call `on_done`, or close the link if opening was canceled."""
         try:
             self.link.open()
         except TalkError as error:

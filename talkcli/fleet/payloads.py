@@ -78,7 +78,7 @@ class Presence:
 
 
 def bridge_rank(presence: Presence | None) -> tuple[float, str] | None:
-    """Return a bridge's rank among those with the same robot name, or None if it is offline.
+    """Return a bridge's rank among the bridges of one robot, or None if the bridge is offline.
 
     The bridge with the lowest rank keeps the robot's name. The others exit.
     """
@@ -217,7 +217,7 @@ def homeassistant_device(name: str, allow: Collection[str], version: str) -> Mes
 
 
 def _command(robot: str, topic_level: str, platform: str, label: str | None, *, allowed: bool) -> JsonObject:
-    """Return a Home Assistant component that sends a request, or an empty one if not allowed."""
+    """Return a Home Assistant component that sends a request. It is empty if the request isn't allowed."""
     if not allowed:
         return {"platform": platform}
     topic = topics.robot(robot, topic_level, topics.HOMEASSISTANT)

@@ -68,7 +68,7 @@ class LocalConnection(ClientCore):
         self.connected(server, self._loop.time())
 
     async def read(self) -> list[bytes]:
-        """Wait for lines, and return them without newlines.
+        """Wait for lines from the server. Return them without newlines.
 
         If the connection has ended, return an empty list.
         """
@@ -85,7 +85,7 @@ class LocalConnection(ClientCore):
         return lines
 
     def send(self, exchange: Exchange) -> bool:
-        """Send a request and expect its answer, or return False if the request is too long."""
+        """Send a request to the server, and expect an answer. Return False if the request is too long."""
         self.register(exchange, self._loop.time())
         line = self.line(exchange)
         if len(line) > MAX_LINE_BYTES:
@@ -137,7 +137,7 @@ class LocalConnection(ClientCore):
 
 
 async def dial(socket: str | None, name: str, *, urgent: bool = False) -> LocalConnection:
-    """Connect to the server, and return the connection after the greeting.
+    """Connect to the server, and wait for its greeting. Return the connection.
 
     Keep trying while the server is busy.
 

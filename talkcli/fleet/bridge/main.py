@@ -37,10 +37,10 @@ if TYPE_CHECKING:
 PRESENCE_EXPIRY_S, PRESENCE_EVERY_S = 150, 60.0
 #: Time allowed for another bridge with the same robot name to answer.
 _RIVAL_LIMIT_S = 1.0
-#: Longest random pause before the first attempt to reconnect to the broker, and before later attempts. Without
-#: randomness, a thousand robots would reconnect at the same moment.
+#: Maximum random pause before the first and before later attempts to reconnect to the broker. Without randomness, a
+#: thousand robots would reconnect at the same moment.
 _FIRST_BROKER_RETRY_S, _LAST_BROKER_RETRY_S = 0.5, 10.0
-#: The connection is closed if the last echo was sent this long after the newest echo that has returned.
+#: If no echo returns for this long, the bridge closes its connection to the broker.
 _ECHO_TIMEOUT_S = 15.0
 #: After refusing a stale message, the bridge sends an extra echo if the last one is at least this old.
 _ECHO_PAUSE_S = 1.0
@@ -184,7 +184,7 @@ class Bridge:
             raise self._error
 
     def end(self, error: BaseException | None = None) -> None:
-        """Make `run` take the robot offline, and then return or raise the given error."""
+        """Make `run` take the robot offline and end. If an error is given, `run` raises it."""
         self._error = self._error or error
         self._ending.set()
 
@@ -204,7 +204,7 @@ class Bridge:
     # -- the connection
 
     async def _stay_connected(self) -> None:
-        """Stay connected to the broker, and read its settings again before each reconnection."""
+        """Stay connected to the broker. Before each reconnection, read the broker's settings again."""
         client_id = f"talk-{self._settings.name}-{self._session}"
         while True:
             try:
@@ -238,12 +238,12 @@ class Bridge:
             raise opener.error
 
     def _on_connect(self, link: Link) -> None:
-        """Start using a new connection, and ask whether another bridge already has the robot's name."""
+        """Start using a new connection. Ask whether another bridge already uses the robot's name."""
         self._disconnected.clear()
         self._link, self._descriptor = link, link.fileno()
         #: whether the broker has retained the presence of another bridge
         self._rival_seen = False
-        #: timer that takes the robot online unless another bridge answers; None until this bridge's question returns
+        #: timer that brings the robot online unless another bridge answers; None until the bridge's question returns
         self._rival_timer: asyncio.TimerHandle | None = None
         self._policy.newest_echo_at = boottime()
         self._loop.add_reader(self._descriptor, self._on_ready, Link.read)
@@ -272,7 +272,7 @@ class Bridge:
         log.write(f"online at {self._broker.url}")
 
     def _disconnect(self, link: Link) -> None:
-        """Close a connection, and end all clients' sessions if it is the current one."""
+        """Close a connection. If it is the current one, end all clients' sessions."""
         if self._link is link:
             self._link, self._online = None, False
             self._unwatch_link()
@@ -287,19 +287,19 @@ class Bridge:
         """Stop watching the descriptor of the connection to the broker."""
         if self._descriptor >= 0:
             for forget in (self._loop.remove_reader, self._loop.remove_writer):
-                # If paho has already closed the socket, the descriptor is removed, but an error is raised.
+                # If paho has already closed the socket, this raises an error after removing the descriptor.
                 with contextlib.suppress(OSError):
                     forget(self._descriptor)
             self._descriptor = -1
 
     def _on_ready(self, action: Callable[[Link], None]) -> None:
-        """Read or write with `action` when the link is ready, and handle the link's new state."""
+        """Call `action` to read from the link or write to it. Handle the link's new state."""
         if link := self._link:
             action(link)
             self._handle_link_state(link)
 
     def _handle_link_state(self, link: Link) -> None:
-        """Close a stuck link, disconnect an ended one, and pause sessions while the broker is slow.
+        """Close a stuck link, clean up after an ended one, and pause sessions while the broker is slow.
 
         Call this after each use of the link.
         """
@@ -325,7 +325,7 @@ class Bridge:
             self._loop.remove_writer(self._descriptor)
 
     def _publish(self, message: Message, qos: int = 1, on_acknowledged: OnAcknowledged | None = None) -> None:
-        """Publish a message, unless there is no connection or the message is too long.
+        """Publish a message if the bridge is connected and the message isn't too long.
 
         The arguments are those of `Link.publish`. By default, a warning is logged if the broker rejects the message.
         """
@@ -405,7 +405,7 @@ class Bridge:
             self._policy.record_echo(sent_at, boottime())
 
     def _handle_presence(self, payload: bytes) -> None:
-        """End this bridge if an older one has its name, or tell a younger one that it is taken.
+        """End this bridge if an older one has the same name. Tell a younger one that the name is taken.
 
         The message may come from this bridge, an earlier one, or another one with the same robot name.
         """
@@ -431,7 +431,7 @@ class Bridge:
     # -- what this bridge publishes about itself
 
     def _publish_presence(self) -> None:
-        """Publish a retained message that says that the robot is online, and describes its server."""
+        """Publish a retained message that shows that the robot is online and describes its server."""
         self._presence_at = self._loop.time()
         presence = replace(self._presence, server=self._publisher.server).to_json()
         line = encode({"talk": PROTOCOL, "version": __version__, **presence})
@@ -443,13 +443,13 @@ class Bridge:
             self._publish(homeassistant_device(self._settings.name, self._settings.allow, __version__))
 
     def _on_server_change(self) -> None:
-        """Report to systemd and in the robot's presence that the server has started or ended."""
+        """Report to systemd and to the fleet that the robot's server has started or ended."""
         self._systemd.schedule_status()
         if self._online:
             self._publish_presence()
 
     def _send_echo(self) -> None:
-        """Publish a message with the current time, which the broker sends back."""
+        """Publish a message that contains the current time. The broker sends it back."""
         self._echo_at = boottime()
         self._publish(Message(self._echo_topic, f"{self._session} {self._echo_at}".encode()))
 
@@ -463,7 +463,7 @@ class Bridge:
             return
         link.tick()
         self._handle_link_state(link)
-        # Compare two sending times, because this process may have been stopped for a while, and have read no echoes.
+        # Compare sending times. If this process was stopped for a while, it hasn't read the returned echoes yet.
         if self._echo_at - self._policy.newest_echo_at > _ECHO_TIMEOUT_S:
             log.write_limited("echo", f"the broker does not return this robot's own messages; {_RIGHTS}")
             self._disconnect(link)
@@ -473,7 +473,7 @@ class Bridge:
             self._publish_presence()
 
     async def _go_offline(self) -> None:
-        """Report the robot as offline unless another bridge uses its name, and disconnect."""
+        """Report the robot as offline unless another bridge uses its name. Then disconnect."""
         link = self._link
         if link is None:
             return

@@ -53,7 +53,7 @@ class RemoteRequest:
     """An accepted request from a remote client."""
 
     user: str
-    #: topic for the answers; None if the client wants none
+    #: topic for the answers; None if the client wants no answers
     reply_topic: str | None
     seq: int | None
     request: Request
@@ -64,7 +64,7 @@ class RemoteRequest:
     start_by: float | None = None
 
     def build_say(self, goal_id: str, now: float) -> Say:
-        """Return the `say` request for the server, with an id and a TTL up to the message's expiry.
+        """Return the `say` request for the server, with an id and a TTL that is limited by the message's expiry.
 
         Args:
             goal_id: the goal's id.
@@ -136,7 +136,7 @@ class Policy:
                 self.newest_echo_at = sent_at
 
     def decide(self, message: Message, kind: str, user: str, now: float) -> RemoteRequest | Refusal | Goodbye | Ignored:
-        """Return the decision to accept, refuse or ignore a message, or to end its client's session.
+        """Decide whether to accept, refuse or ignore a message, or to end the client's session.
 
         Args:
             message: a message on a request topic of the robot or one of its groups.
@@ -263,7 +263,7 @@ class RemoteGoals:
         return not (say.preempt or say.flush)
 
     def has_room(self, say: Say) -> bool:
-        """Return whether the limit for remote goals allows a goal to be sent to the server now.
+        """Return whether a goal can be sent to the server without exceeding the limit for remote goals.
 
         There is always room for a goal that replaces another goal with the same key.
         """
@@ -275,7 +275,7 @@ class RemoteGoals:
         self._goals.setdefault(goal_id, (key, False))
 
     def record_reply(self, goal_id: str, *, pending: bool) -> None:
-        """Record from the server's reply to `say` whether a goal is pending.
+        """Record whether a goal is pending, according to the server's reply to `say`.
 
         If it isn't, remove the goal. The reply is ignored if an event has already confirmed that the goal is pending.
 
@@ -294,11 +294,11 @@ class RemoteGoals:
         self._goals[goal_id] = key, True
 
     def remove(self, goal_id: str) -> bool:
-        """Remove a goal that is no longer pending, and return whether it was counted."""
+        """Remove a goal that is no longer pending. Return whether it was counted."""
         return self._goals.pop(goal_id, None) is not None
 
     def replace_pending(self, pending: Iterable[tuple[str, str | None]]) -> None:
-        """Replace all pending goals. The new goals are given as pairs of id and key.
+        """Replace the recorded pending goals with the given pairs of goal id and key.
 
         Goals that are still on their way to the server are kept.
         """
@@ -307,7 +307,7 @@ class RemoteGoals:
 
 
 def without_texts(message: JsonObject, hidden: tuple[str, ...] = ("text", "spoken")) -> JsonObject:
-    """Return a copy of a message in which the given fields of its goals are null."""
+    """Return a copy of a message, with the given fields of its goals set to null."""
     return {
         name: {**each, **dict.fromkeys(hidden)} if isinstance(each, dict) and "text" in each else each
         for name, each in message.items()

@@ -52,7 +52,7 @@ _STATUS_EVERY_S = 1.0
 _STATUS_AFTER_CHANGE_S = 0.1
 #: Maximum length of a goal's text in the status. Longer texts are cut off.
 _MAX_STATUS_TEXT_CHARS = 1_000
-#: Longest random pause before the first attempt to reconnect to the server, and before later attempts.
+#: Maximum random pause before the first and before later attempts to reconnect to the server.
 _FIRST_SERVER_RETRY_S, _LAST_SERVER_RETRY_S = 0.2, 5.0
 
 
@@ -126,7 +126,7 @@ class Publisher:
         log.write("the connection to the server has ended")
 
     def schedule_status(self) -> None:
-        """Publish the robot's status after a short delay, unless this is already scheduled."""
+        """Schedule the robot's next status message, unless one is already scheduled."""
         if self._timer is None:
             due = max(self._loop.time() + _STATUS_AFTER_CHANGE_S, self._published_at + _STATUS_EVERY_S)
             self._timer = self._loop.call_at(due, self._publish_status)
@@ -161,7 +161,7 @@ class Publisher:
             self._sessions.remember(each, server.boot)
         log.write(f"connected to the server at {log.sanitize(server.path)} (pid {server.pid})")
         server_info: JsonObject = {"boot": server.boot, "pid": server.pid, "version": status.server.get("version")}
-        # Leave out features that this bridge doesn't know, because it may not pass on their requests.
+        # Leave out features that this bridge doesn't know, because it may be unable to pass on their requests.
         server_info["features"] = [each for each in FEATURES if each in (server.server.features or ())]
         self._set_server(server_info, status, server.boot)
 

@@ -52,7 +52,7 @@ _MAX_ID_PREFIX_CHARS = 48
 #: Message to a client after the server has closed the client's connection.
 _SERVER_GONE = "the robot's talk server closed the connection"
 _ALIVE = b'{"event": "alive"}\n'
-#: Lines that start with one of these are published with QoS 0, because losing one does no harm.
+#: Lines that start with one of these are published with QoS 0, because losing them does no harm.
 _UNRELIABLE = (b'{"event": "word"', b'{"event": "alive"')
 
 
@@ -93,7 +93,7 @@ class RemoteSessions:
         self._loop = asyncio.get_running_loop()
         self._sessions: dict[tuple[str, str | None], RemoteSession] = {}
         self._release_handle: asyncio.Handle | None = None
-        #: the client that has canceled pending goals since `_send_or_cancel_waiting` last ran; None if no client has
+        #: the client that canceled pending goals after the last run of `_send_or_cancel_waiting`, or None
         self._canceled_by: By | None = None
 
     # -- from the broker
@@ -109,7 +109,7 @@ class RemoteSessions:
             session.refuse(request, Busy.code, f"{self.name} already has {MAX_SESSIONS} remote clients")
 
     def handle_goodbye(self, user: str, reply_topic: str) -> None:
-        """End a session after the client's goodbye, once its important requests are answered."""
+        """After a client's goodbye, end its session once important requests are answered."""
         if session := self._sessions.get((user, reply_topic)):
             session.handle_goodbye()
 
@@ -120,7 +120,7 @@ class RemoteSessions:
         self.may_read.set()
 
     def tick(self) -> None:
-        """End silent clients' sessions, and send signs of life to clients with waiting goals.
+        """End the sessions of silent clients. Tell other clients if their goals are still waiting.
 
         Call this every few seconds.
         """
@@ -133,7 +133,7 @@ class RemoteSessions:
                 session.send_alive()
 
     def _make_room(self, *, urgent: bool) -> bool:
-        """End an idle session if there are too many, and return whether there is room for one.
+        """End an idle session if there are too many. Return whether there is room for a new one.
 
         For an `urgent` request, any session may be ended.
         """
@@ -157,7 +157,7 @@ class RemoteSessions:
         return sum(each.size_bytes for session in self._sessions.values() for each in session.unanswered)
 
     def cancel_waiting(self, cancel: Cancel, canceled_by: By | None) -> list[Goal]:
-        """Cancel the goals waiting in the bridge that match a `cancel` request, and return them."""
+        """Cancel the bridge's waiting goals that match a `cancel` request. Return these goals."""
         selected = [self.waiting[each] for each in cancel.select_waiting([say for _, say, _ in self.waiting])]
         self.waiting = [each for each in self.waiting if not any(each is other for other in selected)]
         ending = State.RECALLED, "canceled", "not spoken: the goal was cancelled before it started", canceled_by
@@ -187,7 +187,7 @@ class RemoteSessions:
     # -- from the watch of the server
 
     def handle_goal_change(self, event: StateChanged, boot: str) -> None:
-        """Update the pending goals after a state change reported by the server with this boot id."""
+        """Update the pending goals after the server with this boot id has reported a state change."""
         goal = event.goal
         if event.state is not State.PENDING:
             counted = self.goals.remove(event.id)
@@ -207,7 +207,7 @@ class RemoteSessions:
             self.ids.add(goal.id, boot, user)
 
     def reset_pending(self, pending: tuple[Goal, ...], boot: str) -> None:
-        """Replace the pending goals with those that the server has just reported."""
+        """Replace the recorded pending goals with those that the server has just reported."""
         self.goals.replace_pending((each.id, each.key) for each in pending if self.ids.is_counted(each.id, boot))
         self.handle_pending_change()
 
@@ -241,7 +241,7 @@ class RemoteSession:
         Args:
             sessions: all sessions, to which this one belongs.
             user: the client's user name at the broker.
-            reply_topic: the topic for answers, or None if the client wants none.
+            reply_topic: the topic for answers, or None if the client wants no answers.
         """
         #: when the client sent its last request, by the event loop's clock
         self.used_at = 0.0
@@ -268,7 +268,7 @@ class RemoteSession:
         return not (self.unanswered or self._awaited or self._watching)
 
     def submit(self, request: RemoteRequest) -> None:
-        """Send a request, queue it until the server is connected, or refuse it if there are too many."""
+        """Send a request, or queue it until the server is connected. Refuse it if there are too many."""
         self.used_at = self._loop.time()
         if self._said_goodbye:  # the client has returned
             self._said_goodbye, self._reply_topic = False, request.reply_topic
@@ -313,7 +313,7 @@ class RemoteSession:
         self._clean_up()
 
     def send_alive(self) -> None:
-        """Send a sign of life to the client if one of its goals is waiting for room in the queue."""
+        """Tell the client if one of its goals is still waiting for room in the server's queue."""
         if self._find_waiting():
             self._publish([(_ALIVE, None)])
 
@@ -347,7 +347,7 @@ class RemoteSession:
     # -- to the server
 
     def _send_request(self, remote: RemoteRequest) -> None:
-        """Send a client's request to the server, after changing, delaying or refusing it if needed."""
+        """Send a client's request to the server. Change, delay or refuse it if necessary."""
         request = remote.request
         if isinstance(request, Say):
             self.send_say(remote, request)
@@ -426,8 +426,8 @@ class RemoteSession:
         """Connect to the server, send queued requests, and publish lines until the connection ends."""
         shared = self._sessions
         try:
-            # A session that ends meanwhile keeps its slot until the server answers. If the server hangs, its backlog
-            # also holds connections that were closed.
+            # A session that ends meanwhile keeps its slot until the server answers. If the server hangs, even closed
+            # connections take up space in its backlog.
             async with shared.dialing:
                 if self._has_ended:
                     return
@@ -472,7 +472,7 @@ class RemoteSession:
         self._end_if_done()
 
     def _process_answer(self, message: JsonObject) -> list[tuple[bytes, bytes | None]]:
-        """Process one line of an answer, and return lines for the client with correlation data."""
+        """Process one line of an answer. Return lines for the client, each with its correlation data."""
         assert self._server
         exchange = self._server.match(message)
         if not isinstance(exchange, _RemoteExchange):
@@ -508,15 +508,15 @@ class RemoteSession:
     # -- to the client
 
     def refuse(self, request: RemoteRequest, code: str, message: str) -> None:
-        """Send an error to the client in place of an answer."""
+        """Answer a client's request with an error."""
         self._publish([(encode(failure(request.seq, code, message)), request.correlation)])
 
     def end_goal(
         self, remote: RemoteRequest, say: Say, state: State, reason: str, message: str, by: By | None = None
     ) -> Goal:
-        """End a goal that was never sent to the server, inform its client, and return it.
+        """End a goal that was never sent to the server, and inform the client. Return the ended goal.
 
-        Its client gets the lines that the server would send.
+        The client gets the lines that the server would send.
 
         Args:
             remote: the client's request.
@@ -560,7 +560,7 @@ class RemoteSession:
             self._sessions.publish(Message(self._reply_topic, payload, correlation=current), int(reliable))
 
     def _shorten_line(self, line: bytes, limit: int) -> bytes:
-        """Return a shorter line for the broker: without texts, or an error, or nothing.
+        """Shorten a line that is too long for the broker. Return a line without texts, an error or nothing.
 
         Return the line without texts if that is short enough. Otherwise, return an error in place of a reply, and an
         empty line in place of an event.

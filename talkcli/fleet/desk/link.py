@@ -88,11 +88,11 @@ class DeskLink:
         self.session = os.urandom(8).hex()
         #: the current MQTT connection, or None if there is none
         self.link: Link | None = None
-        #: the error, if the last attempt to connect failed or the broker rejected the marker message
+        #: the error if an attempt to connect failed or the broker rejected the marker message, otherwise None
         self.failure: TalkError | None = None
         #: when the marker message came back after the retained messages (monotonic time), or None until then
         self.marker_at: float | None = None
-        #: calls to process received messages and rejected requests. `poll` makes them when the link isn't locked.
+        #: functions that process received messages and rejected requests; `poll` calls them without locking the link
         self._calls: deque[Callable[[], object]] = deque()
         self._opening: LinkOpener | None = None
         self._failed_attempts = 0
@@ -115,7 +115,7 @@ class DeskLink:
         return topics.reply(self.user, self.session, robot)
 
     def poll(self, timeout: float, interrupt: Mapping[int, int] | None = None) -> bool:
-        """Wait for messages, pass them to the handler, and return whether data was read.
+        """Wait for messages, and pass them to the handler. Return whether data was read.
 
         Reconnect if necessary.
 
@@ -135,7 +135,7 @@ class DeskLink:
         wake = self._wake_reader.fileno()
         watched = {wake: select.POLLIN}
         descriptor = -1 if link is None else link.fileno()
-        if link is not None and descriptor >= 0:  # It is -1 if another thread closed the link.
+        if link is not None and descriptor >= 0:  # The descriptor is -1 if another thread closed the link.
             watched[descriptor] = select.POLLIN | (select.POLLOUT if link.wants_write else 0)
         ready = wait_ready(watched, min(timeout, due), interrupt)
         if wake in ready:
@@ -216,7 +216,7 @@ class DeskLink:
             self.link.publish(Message(topic, b"", response=response), 0)
 
     def _topics(self, to: str, *, is_group: bool) -> tuple[str, str]:
-        """Return the topics for requests to a robot or a group, and for their replies."""
+        """Return the topic for requests to a robot or a group, and the topic for replies."""
         topic = topics.group if is_group else topics.robot
         response = topics.reply(self.user, self.session) if is_group else self.reply_topic(to)
         return topic(to, topics.REQUEST, self.user), response
@@ -228,13 +228,13 @@ class DeskLink:
             self._wake_writer.send(b"\0")
 
     def flush(self, timeout: float) -> None:
-        """Poll until the broker has acknowledged all messages, but for at most `timeout` seconds."""
+        """Wait until the broker has acknowledged all messages, but for at most `timeout` seconds."""
         end = time.monotonic() + timeout
         while self.link is not None and self.link.outstanding_bytes and (left := end - time.monotonic()) > 0:
             self.poll(left)
 
     def close(self, *, forked: bool = False) -> None:
-        """Close the connection for good, or only a forked child's copies of its descriptors.
+        """Close the connection for good. In a forked child, close only its copies of the descriptors.
 
         Args:
             forked: whether this is a forked child process.
@@ -247,7 +247,7 @@ class DeskLink:
         self._wake_writer.close()
 
     def _rejection_error(self, code: int, action: str) -> TalkError:
-        """Return the error to raise if the broker has rejected a message or a subscription.
+        """Return the error to raise after the broker has rejected a message or a subscription.
 
         Args:
             code: the reason code from the broker.
@@ -260,13 +260,16 @@ class DeskLink:
         return AccessDenied(f"{words}; add the lines of an operator to its access rules: talk bridge --print-acl")
 
     def _no_answer_error(self, timeout: float) -> TalkError:
-        """Return the error to raise if the retained messages don't arrive within `timeout` seconds."""
+        """Return AccessDenied or ServerUnavailable to explain why retained messages didn't arrive in time.
+
+        It is AccessDenied if the broker is connected but hasn't sent back the marker message.
+        """
         if self.link is None or self.marker_at is not None:
             return ServerUnavailable(f"the broker at {self.broker.url} did not answer within {timeout:g} s")
         return self._rejection_error(REASON_NOT_AUTHORIZED, f"read {topics.reply(self.user, '+', '+')}")
 
     def _maintain(self, link: Link | None, now: float) -> float:
-        """Connect or keep the connection alive, and return the seconds until the next call is due."""
+        """Connect, or keep the connection alive. Return the seconds until the next call is due."""
         if link is not None:
             link.tick()
             if self.marker_at is None or self.retained_received:

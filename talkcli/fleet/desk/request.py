@@ -26,7 +26,7 @@ _GLOB = re.compile(r"[A-Za-z0-9._*?\[\]!-]+")
 
 
 def selects_several(text: str) -> bool:
-    """Return whether a value of `--robot` is a pattern or a group, and not the name of a single robot."""
+    """Return whether a value of `--robot` is a pattern or a group instead of a single robot's name."""
     return text.startswith(_GROUP_PREFIX) or any(each in text for each in _WILDCARDS)
 
 
@@ -57,7 +57,7 @@ class Selection:
         return None
 
     def includes(self, presence: Presence) -> bool:
-        """Return whether a robot is selected. It doesn't have to be online."""
+        """Return whether a robot is selected. The robot may be offline."""
         if self.group is not None:
             return self.group == topics.ALL_ROBOTS or self.group in presence.groups
         return fnmatchcase(presence.name, self.text)

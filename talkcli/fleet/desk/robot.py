@@ -137,7 +137,7 @@ class RobotConnection(Connection):
             self._desk.wake()  # The request will be sent when the robot is back.
 
     def expect_reply(self, exchange: RobotExchange) -> None:
-        """Register a request that was sent to the robot's group, so that its answer is expected."""
+        """Expect the robot's answer to a request that was sent to its group."""
         exchange.sent = True
         self._published_at = time.monotonic()
         self.register(exchange, self._published_at)
@@ -155,7 +155,7 @@ class RobotConnection(Connection):
                 self._send_without_answer(Cancel((goal_id,)))
 
     def _send_without_answer(self, request: Request) -> bool:
-        """Send a request whose answer is ignored. Return whether it could be sent."""
+        """Send a request, and ignore its answer. Return whether it could be sent."""
         exchange = RobotExchange(request)
         exchange.number = next(self._numbers)
         return self._publish(exchange)
@@ -204,7 +204,7 @@ class RobotConnection(Connection):
         return ProtocolMismatch(f"{self.robot}: {error.message}") if error else None
 
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
-        """Return the error for a refused request, with its own class for each error of the bridge."""
+        """Return the error for a refused request. Each error of the bridge has its own class."""
         error = super().refusal(reply, items)
         kinds = {"not_allowed": AccessDenied, "no_server": NoServer, "stale": ServerUnavailable, "lost": Lost}
         kind = kinds.get(error.code)
@@ -243,7 +243,7 @@ class RobotConnection(Connection):
                 self.receive(message.payload, time.monotonic())
 
     def _mark_absent(self, why: str, error: type[ServerUnavailable] = ServerUnavailable) -> None:
-        """Record that the robot can't receive requests, and which error to raise while it can't."""
+        """Record that the robot can't receive requests, and which error to raise in the meantime."""
         self.absence, self._absence_error = why, error
         if self.absent_since is None:
             self.absent_since = time.monotonic()
@@ -272,7 +272,7 @@ class RobotConnection(Connection):
     # -- connecting
 
     def wait_online(self, give_up: float) -> None:
-        """Wait until the robot can receive requests, or raise an error at the time `give_up`.
+        """Wait until the robot can receive requests. Raise an error if it still can't at the time `give_up`.
 
         `give_up` is a monotonic time. The errors are the same as those of `connect_robot`.
         """
@@ -370,12 +370,12 @@ class RobotConnection(Connection):
         self._begin(Exchange(Wait((str(request.id),), request.feedback), on_reply, on_failure), now)
 
     def _begin(self, exchange: Exchange, now: float) -> None:
-        """Queue a goal lookup, and send it now if the number of open lookups allows it."""
+        """Queue the lookup of a goal, and send it now unless too many lookups are open."""
         self._lookups.append(exchange)
         self._send_lookups(now)
 
     def _send_lookups(self, now: float) -> None:
-        """Send queued lookups, up to the maximum number of open ones."""
+        """Send queued lookups until the maximum number of lookups is open."""
         open_count = sum(not isinstance(each, RobotExchange) for each in self.exchanges.values())
         for _ in range(min(len(self._lookups), _MAX_OPEN_LOOKUPS - open_count)):
             exchange = self._lookups.popleft()
@@ -383,7 +383,7 @@ class RobotConnection(Connection):
             self._publish(exchange)
 
     def dispatch(self, message: JsonObject, now: float) -> Exchange | None:
-        """Process a message from the server or the bridge, and return the exchange that it ends."""
+        """Process a message from the server or the bridge. Return the exchange that it ends, if any."""
         if message.get("event") == "gone":
             self.end(printable(str(message.get("message") or "the connection to the server was lost")))
             return None
@@ -405,7 +405,7 @@ class RobotConnection(Connection):
         self._desk.wake()
 
     def _drop(self) -> None:
-        """Close the connection to the broker, or only a forked child's copies of its descriptors."""
+        """Close the connection to the broker. In a forked child, close only its copies of the descriptors."""
         self._desk.close(forked=os.getpid() != self._process)
 
 

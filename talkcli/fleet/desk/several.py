@@ -89,7 +89,7 @@ class FleetRequest:
         self._included, self._unfinished = set[str](), set[str]()
         self._outcomes: deque[Outcome] = deque()
         self._numbers = itertools.count(FIRST_SEQ)
-        #: the number of the message to the group, if the robots are a group
+        #: the number of the message to the group, if the request goes to a group
         self._number = next(self._numbers)
         #: the error if the broker has rejected the message to the group
         self._refused: TalkError | None = None
@@ -107,10 +107,10 @@ class FleetRequest:
                 ttl = DEFAULT_TTL_S if request.ttl is None else request.ttl
                 request = replace(request, id=request.id or new_goal_id(self._desk), ttl=ttl)
             self.request = request
-            #: the rejected goal, if the text is too long for any server. The request isn't sent then.
+            #: the rejected goal, if the text is too long for any server. In that case, the request isn't sent.
             self._rejected = too_long(request) if isinstance(request, Say) else None
             self._desk.wait_for_retained(patience_s, interrupt=interrupt)
-            #: when the sentence expires (in `boottime`), or None if it never does
+            #: when the sentence expires (by the `boottime` clock), or None if it never does
             self._expires_at = boottime() + request.ttl if isinstance(request, Say) and request.ttl else None
             self._began = True
             self._send_to_known_robots()
@@ -304,7 +304,7 @@ class FleetRequest:
             robot.send()
 
     def _on_reply(self, name: str, message: Message) -> None:
-        """Process lines from a robot, and include it if it answers a request to its group.
+        """Process lines from a robot. Include the robot if it answers a request to its group.
 
         If a robot answers a request to a group, it is a member of the group, even if it seemed to be absent.
         """
@@ -373,7 +373,7 @@ class RobotRequest:
 
         Args:
             number: the number of the request.
-            expires_at: when the sentence expires (in `boottime`), or None if it never does.
+            expires_at: when the sentence expires (by the `boottime` clock), or None if it never does.
         """
         exchange = RobotExchange(self._request, self._on_reply, self._on_failure)
         exchange.number, exchange.expires_at = number, expires_at
@@ -381,7 +381,7 @@ class RobotRequest:
         self.was_asked = True
 
     def update(self, *, fail_if_late: bool) -> None:
-        """Keep the bridge's session alive, and record the outcomes of goals that have newly ended.
+        """Keep the bridge's session alive, and record the outcomes of goals that have just ended.
 
         Args:
             fail_if_late: whether to record a failure if the robot hasn't answered in time.

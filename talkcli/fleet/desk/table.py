@@ -155,7 +155,7 @@ class FleetTranscript:
         self._boots: dict[str, str] = {}
 
     def begin(self, robots: Sequence[Presence], broker: str, screen: Screen, now: float) -> list[str]:
-        """Return the first line, which counts the robots, and reserve space for their names."""
+        """Return the first line, which shows the number of robots. Reserve space for their names."""
         for each in robots:
             self._columns.pad_robot(each.name, screen)  # All names must be known first, so that all lines are aligned.
             self._boots[each.name] = _boot_id(each)

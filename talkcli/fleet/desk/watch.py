@@ -251,7 +251,7 @@ class FleetWatch:
     # -- time limits
 
     def _handle_due(self, now: float) -> None:
-        """Report missing robots and retained messages, or raise Lost if the broker stays away."""
+        """Process retained messages, and report missing robots. Raise Lost if the broker stays away."""
         if self._retained is not None and self._desk.retained_received:
             self._process_retained(self._retained, now)
         if self._away_since is not None and now - self._away_since >= ABSENCE_LIMIT_S:
