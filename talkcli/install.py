@@ -39,13 +39,13 @@ def command(*packages: str, reinstall: bool = False) -> str:
 
     Args:
         packages: names of the packages.
-        reinstall: reinstall packages that are installed already.
+        reinstall: whether to reinstall packages that are already installed.
     """
     return command_for(_inspect_environment(), packages, reinstall=reinstall)
 
 
 def neural_command(*more: str, reinstall: bool = False) -> str:
-    """Return the command that installs neural voices' packages, or advice on a 32-bit system."""
+    """Return the command that installs the packages for neural voices. On a 32-bit system, return advice."""
     if not IS_64_BIT:
         return "neural voices need a 64-bit system; use an espeak voice, such as en"
     return command(*NEURAL_PACKAGES, *more, reinstall=reinstall)

@@ -1,4 +1,4 @@
-"""Wait for file descriptors, with a time limit.
+"""A function that waits for file descriptors, with a time limit.
 
 Other descriptors can interrupt the wait.
 """
@@ -22,7 +22,7 @@ class Interrupted(Exception):
 def wait_ready(
     watched: Mapping[int, int], timeout: float | None, interrupt: Mapping[int, int] | None = None
 ) -> set[int]:
-    """Return the descriptors that become ready before the timeout, or raise Interrupted.
+    """Wait until a descriptor is ready or the time is up. Return the descriptors that are ready.
 
     Args:
         watched: the poll events to wait for, by descriptor. Errors and hang-ups always count.

@@ -19,7 +19,7 @@ _RELEASE_S = 0.01
 
 
 def open_pipes(count: int) -> list[tuple[int, int]]:
-    """Open pipes, and return both ends of each.
+    """Open pipes. Return both ends of each pipe.
 
     If one can't be opened, none is left open.
     """
@@ -47,7 +47,7 @@ def is_held(pipe: int, seconds: float = 0.0) -> bool:
 
 
 def kill_holders(pipe: int) -> bool:
-    """Kill all other processes that hold a pipe open, and return whether any was killed.
+    """Kill all other processes that hold a pipe open. Return whether any was killed.
 
     Another user's process can't be killed, and without /proc no process can be found.
     """
@@ -60,7 +60,7 @@ def kill_holders(pipe: int) -> bool:
 
 
 def kill(pids: Iterable[int]) -> bool:
-    """Kill the processes, and return whether any was killed.
+    """Kill the processes. Return whether any was killed.
 
     A negative id means a process group.
     """

@@ -41,7 +41,7 @@ class RateLimit:
         self._event_count = 0
 
     def count_event(self, now: float) -> int | None:
-        """Count an event, and return the number suppressed before it, or None to suppress it.
+        """Count an event. Return the number of events suppressed before it, or None to suppress this one.
 
         Only the events that have been suppressed since the last allowed event are counted.
         """
@@ -60,7 +60,7 @@ _rate_limits: dict[str, RateLimit] = {}
 
 
 def write(message: str) -> None:
-    """Write a line to the log, or count it as lost if that would block.
+    """Write a line to the log, or count it as lost if writing would block.
 
     The next line that is written gives the number of lost lines.
     """
@@ -82,7 +82,7 @@ def write(message: str) -> None:
 def write_limited(kind: str, message: str) -> None:
     """Write a line to the log, at most once a minute for each kind.
 
-    The next line of the kind gives the number of suppressed lines.
+    The next line of the same kind gives the number of suppressed lines.
     """
     suppressed = _rate_limits.setdefault(kind, RateLimit(1, _REPEAT_AFTER_S)).count_event(time.monotonic())
     if suppressed is not None:

@@ -101,7 +101,7 @@ class ServiceManager:
         self._timers[name] = self._loop.call_later(seconds, act)
 
     def _send(self, **fields: str) -> None:
-        """Send a notification with these fields and any unsent ones, and retry later if this fails."""
+        """Send these fields and any unsent ones to the service manager. If this fails, retry later."""
         if self._socket is None:
             return
         self._status = fields.get("STATUS", self._status)
@@ -128,7 +128,7 @@ def _parse_notify_address(value: str) -> str:
 
 
 def _watchdog_interval() -> float | None:
-    """Return the seconds between two watchdog notifications, or None without a watchdog."""
+    """Return the interval between watchdog notifications in seconds, or None without a watchdog."""
     timeout, own_pid = os.environ.get("WATCHDOG_USEC", ""), str(os.getpid())
     is_for_us = os.environ.get("WATCHDOG_PID", own_pid) == own_pid  # the watchdog may watch another process
     timeout_us = int(timeout) if timeout.isdecimal() and is_for_us else 0

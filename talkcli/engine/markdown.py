@@ -47,7 +47,7 @@ _TOKEN = re.compile(
     | (?P<link>(?:(?<![^\s\[])!)?\[)""",
     re.VERBOSE | re.DOTALL | re.IGNORECASE,
 )
-#: Matches the end of a text that may become a token.
+#: Matches the end of a text if it may become a token when more text arrives.
 _PARTIAL_TOKEN = re.compile(
     r"(?:(?<!~)~+|(?<![^\s\[])!|(?<!\w)(?:ht?t?|https?:?/?|w{1,3})|<(?:!(?:-(?:-.*)?)?|(?:https?:|mailto:)[^\s<>]*"
     rf"|[\w.+-]+@?[\w.-]*|/[a-z]*[1-6]?|/?(?:{_TAG_NAMES})[\s/][^<>]*)?)\Z",
@@ -59,8 +59,8 @@ _LINE = re.compile(
     r"|(?P<block>(?P<fence>`{3,}(?=[^`\n]*(?:\n|\Z))|~{3,})[^\n]*)|(?P<row>\|[ \t]*)|(?P<item>(?:\[\^[^\]\s]{1,50}\]:"
     r"|(?:[-*+•]|(?P<number>\d{1,3})[.)])(?=[ \t\n]|\Z)(?:[ \t]+\[[ xX]\](?=[ \t\n]))?)[ \t]*)|(?P<paragraph>))"
 )
-#: Matches an incomplete line if more text decides which marks it begins with. No two neighbouring repetitions match the
-#: same characters, so the time is proportional to the length of the line.
+#: Matches an incomplete line if its first marks can't be recognized until more text arrives. No two
+#: neighbouring repetitions match the same characters, so the time is proportional to the length of the line.
 _PARTIAL_LINE = re.compile(
     r"[ \t>]*(?![ \t>])(?:[-*+•=_#|:`~ \t]{0,500}(?:(?<=[ \t])\[?[ xX]?\]?)?|\d{1,3}(?:[.)](?:[ \t]+\[?[ xX]?\]?)?)?"
     r"|(?:`{3,}|~{3,}(?!~))[^`\n]{0,500}|\[[^\]\n]{0,200}(?:\](?::[^\n]{0,500})?)?)\Z"
@@ -91,8 +91,8 @@ class MarkdownReader:
 
     The text may arrive in pieces of any size.
 
-    The results joined have the length of the text so far, except for an end that can't be read yet, such as a link
-    without its address. They don't depend on how the text was divided, so a caller may cut them anywhere.
+    Joined together, the results are as long as the text so far, except for an end that can't be read yet, such as a
+    link without its address. They don't depend on how the text was divided, so a caller may cut them anywhere.
     """
 
     def __init__(self) -> None:
@@ -108,7 +108,7 @@ class MarkdownReader:
         self._in_table = False
         #: whether the current paragraph began as an item of a list
         self._in_list = False
-        #: whether "**" or the like is open, so that it may be closed within a word
+        #: whether "**" or a similar mark is open, so that it may be closed within a word
         self._is_strong = False
         #: the offsets of marks whose beginning was found earlier, with their lengths
         self._closing: dict[int, int] = {}
@@ -116,7 +116,7 @@ class MarkdownReader:
         self._last = ""
 
     def read(self, text: str, *, ended: bool = False) -> str:
-        """Add text, and return the text that is newly readable, with blanks in place of marks.
+        """Add text. Return the newly completed text, with blanks in place of marks.
 
         With `ended`, return the whole rest.
         """
@@ -201,7 +201,7 @@ class MarkdownReader:
         return " " * (len(line) + (end >= 0))
 
     def _read_span(self, kind: str, token: re.Match[str]) -> str | None:
-        """Return the replacement for the beginning of a span, and remember its end.
+        """Return the replacement for the beginning of a span, and remember where the span ends.
 
         If the span is code, return the whole span.
         """
@@ -227,7 +227,7 @@ class MarkdownReader:
         return " " * len(mark)
 
     def _read_mark(self, kind: str, token: re.Match[str]) -> str:
-        """Return a token that begins neither a line nor a span, with its marks blanked."""
+        """Blank the marks of a token that begins neither a line nor a span. Return the result."""
         text, (start, end), mark = self._text, token.span(), token.group()
         before, after = text[start - 1 : start] or "\n", text[end : end + 1] or "\n"
         kept = 0  # number of characters at the end of the token that aren't marks
@@ -257,5 +257,5 @@ def _is_letter(character: str) -> bool:
 
 
 def blank_markdown(text: str) -> str:
-    """Return a text of the same length in which the marks of Markdown are blanks or pauses."""
+    """Replace the marks in a Markdown text with blanks or pauses. The length stays the same."""
     return MarkdownReader().read(text, ended=True)

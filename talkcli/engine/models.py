@@ -76,7 +76,7 @@ class VoiceDescription:
 
 
 def missing_package() -> str | None:
-    """Return an error message if a package for neural voices is missing, otherwise None."""
+    """Return an error message if a package for neural voices is missing, or None."""
     from importlib.util import find_spec
 
     missing = next((each for each in install.NEURAL_PACKAGES if find_spec(each) is None), None)
@@ -132,7 +132,7 @@ def read_description(path: str) -> VoiceDescription:
 
 
 def open_checked(path: str, advice_if_missing: str = "restore it", model_path: str = "") -> Any:
-    """Open a voice's file, or raise VoiceFileError if another user could change it.
+    """Open a voice's file. Raise VoiceFileError if another user could change it.
 
     Args:
         path: The path of the file.
@@ -178,7 +178,7 @@ def _require_safe_paths(*paths: str) -> None:
 
 
 def _walk_path(path: str) -> Iterator[tuple[str, bool]]:
-    """Follow the links in a path, and yield each directory and then the file itself.
+    """Follow the links in a path. Yield each directory, and then the file itself.
 
     Each path comes with a flag, which is True if another directory follows.
 
@@ -328,7 +328,7 @@ def _parse_description(content: Any) -> VoiceDescription:
 
 
 def _shorten(value: object) -> str:
-    """Convert a value to text, and cut off long text."""
+    """Convert a value to text, and shorten it if it is too long."""
     words = str(value)
     return words if len(words) <= _MAX_SHOWN_CHARS else f"{words[:_MAX_SHOWN_CHARS]}…"
 

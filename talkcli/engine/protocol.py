@@ -224,7 +224,7 @@ class StartFailed:
 class VoiceList:
     """All voices that the driver offers.
 
-    Sent once, right after `Ready`, if `Configure.list_voices` is true.
+    It is sent once, right after `Ready`, if `Configure.list_voices` is true.
     """
 
     voices: tuple[Voice, ...]
@@ -250,7 +250,7 @@ class VoiceUnloaded:
 class VoiceMemory:
     """The memory used by neural voices.
 
-    Sent before `VoiceLoaded`, and after a sentence or a `DropVoice`.
+    It is sent before `VoiceLoaded`, and after a sentence or a `DropVoice`.
     """
 
     voice: str  # ID of the voice that was loaded or used, without a speaker; empty after `DropVoice`
@@ -273,7 +273,7 @@ class Alive:
 
 @frozen
 class Word:
-    """The start of a word in the output. Sent when the word becomes audible."""
+    """The start of a word in the sound. The process sends it when the word is heard."""
 
     id: str
     start: int  # offset of the word's first character in the text
@@ -284,7 +284,7 @@ class Word:
 
 @frozen
 class TextMissing:
-    """The goal became silent because text is missing, or it continues."""
+    """The goal has become silent because text is missing, or it has continued."""
 
     id: str
     missing: bool
@@ -294,7 +294,7 @@ class TextMissing:
 class OutputChanged:
     """The device, volume and mute state of the current output.
 
-    Sent when they become known or change.
+    It is sent when they become known or change.
     """
 
     id: str
@@ -305,7 +305,7 @@ class OutputChanged:
 class VoiceChosen:
     """The voice that speaks the sentence.
 
-    Sent again if a fallback voice replaces it before the first word.
+    It is sent again if a fallback voice replaces it before the first word.
     """
 
     id: str

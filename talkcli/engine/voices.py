@@ -64,7 +64,7 @@ def list_voices(engine: Any) -> tuple[Voice, ...]:
 
 
 def find_voice(wanted: str, voices: tuple[Voice, ...], server_voice: str | None = None) -> Voice | None:
-    """Find a voice by name. Return None if there is no match, or more than one.
+    """Find a voice by name. Return None if no voice matches, or several do.
 
     The name is compared with the ids, the last parts of the ids, the names and the languages of the voices, in this
     order, ignoring case. It may end with a variant ("en-us+f3"). The returned voice's id includes the variant. If

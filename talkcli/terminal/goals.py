@@ -178,7 +178,7 @@ def format_duration(seconds: float) -> str:
 
 
 def _goal_table(label: str, goals: Sequence[Goal], id_width: int, screen: Screen, now: float) -> list[str]:
-    """Return one line for each goal, cut to the terminal's width. The first has the label."""
+    """Return one line for each goal, cut to the terminal's width. The first line has the label."""
     labels = [label, *[""] * (len(goals) - 1)]
     heads = [_pad_label(name) + _head_columns(goal, id_width, screen) for name, goal in zip(labels, goals, strict=True)]
     tails = [_tail_forms(goal, screen, now) for goal in goals]
@@ -219,7 +219,7 @@ def _shown_text(goal: Goal) -> str | None:
 
 
 def _silence_reasons(goal: Goal) -> list[str]:
-    """Return why an unfinished goal is silent at the moment, if it is."""
+    """Return the reasons why an unfinished goal is silent at the moment, if any."""
     if goal.state.terminal:
         return []
     return ["paused"] * goal.paused + ["waiting for text"] * goal.waits
@@ -301,7 +301,7 @@ def listed_reason_forms(goal: Goal, screen: Screen) -> list[str]:
 
 
 def reason_forms(goal: Goal, screen: Screen) -> list[str]:
-    """Return descriptions of why a goal ended, or of its duration if it succeeded, longest first."""
+    """Return descriptions of why a goal ended, longest first. If it succeeded, return its duration."""
     if goal.state is State.SUCCEEDED:
         return [", ".join([*([] if goal.duration is None else [f"{goal.duration:.1f} s"]), *_muted_note(goal)])]
     reason = printable(goal.reason or goal.state.name.lower())

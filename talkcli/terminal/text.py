@@ -101,7 +101,7 @@ class Screen:
 
 
 def printable(text: str, limit: int | None = None) -> str:
-    """Cut a text after `limit` characters, and escape invisible ones in it."""
+    """Cut a text after `limit` characters, and escape the invisible characters in it."""
     kept = text[:limit]
     if not (kept.isascii() and kept.isprintable() and "\\" not in kept):
         kept = "".join(map(_escape, kept))
@@ -158,15 +158,15 @@ def longest_fitting(forms: Sequence[str], columns: int | None) -> str:
 
 
 def room_beside(text: str, columns: int, screen: Screen) -> int:
-    """Return how many of `columns` the details beside a text may take.
+    """Return how many of `columns` may be used for the details beside a text.
 
-    They leave at least half of the line to the text, or 16 columns if whole ids are shown.
+    The details leave at least half of the line to the text, or 16 columns if whole ids are shown.
     """
     return columns - len(COLUMN_GAP) - min(width(text), _MIN_TEXT_COLUMNS if screen.long else columns // 2)
 
 
 def fit_row(head: str, text: str, details: Sequence[str], text_width: int, screen: Screen) -> str:
-    """Format a table row with a head, a text and the longest of the details that fits.
+    """Format a table row with a head, a text and the longest details that fit.
 
     Args:
         head: the columns before the text.
@@ -260,7 +260,10 @@ class MeasuredText:
         return "".join(self._shown[start:end])
 
     def _first_shown(self, column: int, max_index: int) -> int:
-        """Return the index, at most `max_index`, of the first character right of `column`."""
+        """Return the index of the first visible character that starts to the right of `column`.
+
+        Return `max_index` if no earlier character does.
+        """
         if column <= 0:
             return 0
         # The ellipsis needs one more column. The first visible character must not be a combining mark.

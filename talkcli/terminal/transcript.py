@@ -99,7 +99,7 @@ class Transcript:
         self._goals: dict[str, Goal] = {}
         #: how many characters of each growing text have been shown, by goal id
         self._shown_chars: dict[str, int] = {}
-        #: the goals of which a word was heard since they last waited for text
+        #: the goals that have spoken a word since they last waited for text
         self._heard: set[str] = set()
         self._paused = False
         self._robot, self._boot = robot, boot
@@ -126,7 +126,7 @@ class Transcript:
         return []  # results aren't shown
 
     def _format_word(self, event: WordHeard, screen: Screen, now: float) -> list[str]:
-        """Record that a word was heard, and return a line with the word, if words are shown."""
+        """Record that a word was heard. If words are shown, return a line with the word."""
         self._heard.add(event.id)
         word = f"{printable(event.word)}{COLUMN_GAP}{event.time:.2f} s"
         return [self._head_columns(event.at or now, "word", None, event.id, screen) + word] * self._with_words

@@ -1,4 +1,4 @@
-"""Decides where a growing text is cut into parts for the synthesizer.
+"""Code that cuts a growing text into parts for the synthesizer.
 
 A part is a sentence if possible, because a synthesizer needs whole sentences for a natural melody. If the player is
 about to run out of sound, a part may be a clause or a few words. The language of the text isn't known here, so the
@@ -12,17 +12,17 @@ from __future__ import annotations
 import re
 import unicodedata
 
-#: Time without new text after which a stop at the end of the text ends a sentence.
+#: If no text arrives for this long, a full stop or similar mark at the end of the text ends the sentence.
 _QUIET_S = 0.1
-#: Time without new text after which a silent player gets the words that are there.
+#: If no text arrives for this long and the player is silent, the words so far are spoken.
 _LONG_QUIET_S = 1.0
-#: Remaining sound at which a clause is spoken without waiting for its sentence.
+#: If the player has less sound left than this, a clause is spoken before the rest of its sentence has arrived.
 _LOW_BUFFER_S = 0.15
-#: Shortest clause, and longest part of a text that still grows.
+#: Minimum length of a clause, and maximum length of a part while the text grows.
 _CLAUSE_CHARS, _PART_CHARS = 12, 300
-#: Length in which the longest abbreviation is found.
+#: How many characters before a dot to search for an abbreviation.
 _ABBREVIATION_CHARS = 24
-#: How long the text must not change before a stop counts as the end of a sentence. `_NEVER` means that it is no end.
+#: How long to wait for more text before a sentence may end at a mark. `_NEVER` means that it can't end there.
 _NO_WAIT, _SHORT_WAIT, _LONG_WAIT, _NEVER = range(4)
 
 _CLOSERS = r"[\"'”’“‘»«›‹)\]}*_~`」』）】》]*"
@@ -38,16 +38,18 @@ _CLAUSE_END = re.compile(
     rf"[,;:]{_CLOSERS}(?=\s)|(?<!\d)[,;:]{_CLOSERS}\Z|(?<=\s)[–—](?=\s|\Z)|—(?=[^\W\d])"
     r"|(?<!\d)[，；：、](?=[\s\w“「『《（]|\Z)|[，；：、](?=[\s“「『《（]|[^\W\d])"
 )
-#: A gap between words. In Chinese, it is the place between two characters. Numbers such as "1 000" have no gap.
+#: A gap between words. In Chinese, this is the place between two characters. Numbers such as "1 000" have no gap.
 _GAP = re.compile(r"(?<=[^\s\d])\s|(?<=\d)\s(?=\s*[^\s\d])|(?<=[\u3000-\u9fff\uff00-\uff60])(?=[\u3400-\u9fff])")
-#: Two characters of one number or flag.
+#: Two characters that belong to the same number or flag.
 _PAIR = re.compile("\\d[\\d.,:]|[.,:]\\d|[\U0001f1e6-\U0001f1ff]{2}")
 _LAST_WORD = re.compile(r"[^\W\d_]*['’]?\Z")
-#: Characters between a stop and the first letter of the next sentence.
+#: Characters that may come between the end of a sentence and the first letter of the next one.
 _LEAD = ' \t\r\n\u00a0\u202f\u3000"“„‘‚«»‹›([{*_~—–¿¡-'
 
-#: What a dot belongs to. The groups say whether the sentence can end there: never, not before a number, often (except
-#: before a part of a time), maybe (only before a word that begins sentences), or, for a number, not before a month.
+#: An abbreviation or a number with a dot. The name of the group says whether the sentence can end at the dot. With
+#: "never", it can't. With "numbered", it can't end before a number. With "often", it can, except before a weekday or a
+#: time zone. With "maybe", it can end only before a word that begins sentences. With "number", it can't end before a
+#: month.
 _ABBREVIATION = re.compile(
     r"""(?:
     (?P<never>(?:\A|\n)[\s>*_\#-]*\(?\d{1,3}|:\s1|(?<![\w.])(?:
@@ -79,7 +81,7 @@ _STARTER = r"""(?:
     |There|These|They|This|Those|To|Today|Tomorrow|Tous|Tout|Trotzdem|Tu|Tú|Um|Una?|Und|Une|Unsere?|Unter|Usted|Über
     |Voici|Von|Vor|Votre|Vous|War|Warum|Was|We|Wenn|Were|What|When|Where|Which|While|Who|Why|Wie|Will|Wir|With|Wo
     |Would|Y|Yes|Yo|You|Your|Zu|Zum)(?![\w.])|(?:L|J|C|N|Qu|Aujourd)['’]"""
-#: What follows if the sentence goes on after an abbreviation.
+#: Matches the text after an abbreviation or a number if the sentence goes on there.
 _REST = {
     "numbered": re.compile(r"\d"),
     "often": re.compile(r"(?:Mon|Tues|Wednes|Thurs|Fri|Satur|Sun)day|(?:East|West)ern|Pacific|[ECMP][SD]?T\b|GMT|UTC"),
@@ -94,7 +96,7 @@ _REST = {
 class GrowingText:
     """A text that grows while it is spoken.
 
-    It knows the position up to which the text was passed to the synthesizer.
+    It keeps track of how much of the text was passed to the synthesizer.
     """
 
     def __init__(self, text: str, *, ended: bool) -> None:
@@ -103,7 +105,7 @@ class GrowingText:
         #: whether no more text will be added
         self.ended = ended
         self._position = 0
-        #: offset before which the text contains no end of a sentence after the position
+        #: offset up to which the text after the position was searched without finding the end of a sentence
         self._searched = 0
         #: time of the last change; None until it is known
         self._changed_at: float | None = None
@@ -120,13 +122,13 @@ class GrowingText:
             self._changed_at = now
 
     def end(self) -> None:
-        """Declare the text complete."""
+        """Mark the text as complete."""
         self.ended = True
 
     def drop_incomplete(self) -> None:
-        """End the text after its last complete sentence, because the producer broke off.
+        """Mark the text as complete, and drop an incomplete sentence at its end.
 
-        Text that was already passed on stays.
+        Text that was already passed to the synthesizer is kept.
         """
         position = self._position
         while (end := self._find_sentence_end(_LONG_WAIT)) is not None:
@@ -134,9 +136,9 @@ class GrowingText:
         self.text, self._position, self.ended = self.text[: self._position], position, True
 
     def take_next_part(self, now: float, buffered_s: float) -> tuple[int, int] | None:
-        """Advance past the next part, and return its offsets, or None if it is too early to cut.
+        """Take the next part of the text. Return its offsets, or None if it is too early to cut.
 
-        A text that has ended is one part. Blanks between parts are skipped.
+        If the text is complete, the rest of it is one part. Blanks between parts are skipped.
 
         Args:
             now: the current time.
@@ -165,7 +167,7 @@ class GrowingText:
         return float("inf")
 
     def _find_part_end(self, now: float, silent_at: float) -> int | None:
-        """Skip blanks, and return the end of the next part, or None if it is too early to cut.
+        """Skip blanks. Return the end of the next part, or None if it is too early to cut.
 
         Args:
             now: the current time.
@@ -195,9 +197,9 @@ class GrowingText:
         return _find_gap(text, start, longest) if waited == _LONG_WAIT else None
 
     def _find_sentence_end(self, waited: int) -> int | None:
-        """Return the end of the next sentence, or None if the text may still go on.
+        """Return the end of the next sentence, or None if the sentence may still go on.
 
-        `waited` says how long the text has not changed, as one of the constants such as `_SHORT_WAIT`.
+        `waited` says how long the text has stayed the same. It is one of the constants such as `_SHORT_WAIT`.
         """
         for found in _SENTENCE_END.finditer(self.text, max(self._position, self._searched)):
             self._searched = found.start()
@@ -211,9 +213,10 @@ class GrowingText:
 
 
 def _required_wait(text: str, start: int, stop: re.Match[str]) -> int:
-    """Return how long to wait for more text before the sentence may end at this stop.
+    """Return how long to wait for more text before a sentence may end at `stop`.
 
-    The sentence begins at `start`. The result is one of the constants such as `_SHORT_WAIT`.
+    The sentence begins at `start`, and `stop` is a match of `_SENTENCE_END`. The result is one of the constants
+    such as `_SHORT_WAIT`.
     """
     kind, end = stop.lastgroup, stop.end()
     sentence = text[start:end]
@@ -247,9 +250,9 @@ def _required_abbreviation_wait(text: str, next_start: int, kind: str) -> int:
 
 
 def _find_gap(text: str, start: int, limit: int) -> int | None:
-    """Return the offset of the last gap between words before `limit`, or None.
+    """Return the offset of the last gap between words before `limit`, or None if there is none.
 
-    The words before the gap must not be too short.
+    The text before the gap must not be too short.
     """
     gaps = [each.start() for each in _GAP.finditer(text, start + _CLAUSE_CHARS, limit + 1)]
     return gaps[-1] if gaps else None
@@ -266,7 +269,7 @@ def _find_break(text: str, start: int, limit: int) -> int:
 
 
 def _may_separate(before: str, after: str) -> bool:
-    """Return whether two neighbouring characters may be in different parts.
+    """Return whether a text may be cut between two neighbouring characters.
 
     Accents, joiners, variation selectors, skin tones and tags belong to the character before them.
     """

@@ -52,7 +52,7 @@ class CannotStart(Exception):
 
 
 def start(configure: protocol.Configure, runner: GoalRunner) -> protocol.Ready:
-    """Start pyttsx3's engine, attach it to the runner, and return the `Ready` message.
+    """Start pyttsx3's engine and attach it to the runner. Return the `Ready` message.
 
     Raises:
         CannotStart: a driver, a voice or a library is missing or unknown.
@@ -79,7 +79,7 @@ def start(configure: protocol.Configure, runner: GoalRunner) -> protocol.Ready:
 
 
 def _register_own_driver(synthesizer_name: str, driver_name: str, runner: GoalRunner) -> CombinedSynthesizer:
-    """Create and return one of `talk`'s synthesizers, and register a pyttsx3 driver for it.
+    """Create one of `talk`'s synthesizers and register a pyttsx3 driver for it. Return the synthesizer.
 
     Raises:
         CannotStart: a library or the default voice is missing.
@@ -171,7 +171,7 @@ class DriverProperties:
         engine.connect("error", self._record_error)
 
     def apply(self, command: protocol.Speak) -> str | None:
-        """Set the properties for a goal, and return the reason if another voice is used.
+        """Set the properties for a goal. Return the reason for a fallback voice, if one is used.
 
         A neural voice may have disappeared since the goal was accepted. The driver then falls back to another of its
         voices, preferably in the same language. It doesn't do so if `voice_only` is set.
@@ -232,9 +232,9 @@ class DriverProperties:
         return found.id
 
     def _set_property(self, name: str, value: Any, label: str) -> None:
-        """Set a property of the engine, or raise CannotSpeak with `label` in its message.
+        """Set a property of the engine. If this fails, raise CannotSpeak with `label` in the message.
 
-        pyttsx3 reports errors through notifications. This method raises them as exceptions. In the messages, `label`
+        pyttsx3 reports errors through notifications. This method raises them as exceptions. In their messages, `label`
         names the property and its value.
 
         Raises:
@@ -275,7 +275,7 @@ class Driver:
         self._playback: Playback | None = None
 
     def iterate(self) -> Iterator[None]:
-        """Speak each stored text, and yield whenever there is none."""
+        """Speak each stored text, and yield whenever none is left."""
         while True:
             if self._text is None:
                 self._proxy.setBusy(False)  # pyttsx3 sends no text while the driver is busy
@@ -286,7 +286,7 @@ class Driver:
             self._speak(text)
 
     def say(self, text: str) -> None:
-        """Store a text to be spoken by the next step of `iterate`."""
+        """Store a text for the next step of `iterate` to speak."""
         self._proxy.setBusy(True)
         self._text = text
 
@@ -348,7 +348,7 @@ class Driver:
         self._proxy.notify("finished-utterance", completed=runner.duration is not None)
 
     def _parts(self, text: str, playback: Playback) -> Iterator[tuple[str, bool]]:
-        """Yield each part of a text once it can be spoken, and whether it is the last one.
+        """Yield each part of a text as soon as it can be spoken, and whether it is the last one.
 
         A text that doesn't grow is a single part. While text is missing, the playback continues.
         """
@@ -370,6 +370,6 @@ class Driver:
                 playback.await_text(min(growing.next_part_at(now, buffered), now + buffered if buffered > 0 else NEVER))
 
     def _notify_word(self, word: TimedWord) -> None:
-        """Store a word's position in the audio in the runner, and notify pyttsx3 of the word."""
+        """Store a word's audio position in the runner, and notify pyttsx3 of the word."""
         self._runner.position = word.position
         self._proxy.notify("started-word", location=word.location, length=word.length)

@@ -60,7 +60,7 @@ HOLD_SILENCE_LIMIT_S = 0.15
 #: How far the word clock may run ahead of the sound. Measurements show 4 to 8 ms.
 CLOCK_ERROR_S = 0.01
 
-#: The minimum length of a gap caused by late samples. A shorter silence is inaudible, and the clock can't measure it
+#: The minimum length of a silence that counts as a gap. A shorter silence is inaudible, and the clock can't measure it
 #: precisely.
 INAUDIBLE_GAP_S = 0.05
 
@@ -112,7 +112,7 @@ class SentenceSamples:
         self._quiet = self._quiet + len(samples) if quiet_count is None else quiet_count * SAMPLE_BYTES
 
     def leading_zeros(self) -> int:
-        """Return how many bytes of zeros the buffer begins with."""
+        """Return how many bytes at the start of the buffer are zero samples."""
         return (len(self._kept) - len(self._kept.lstrip(b"\0"))) // SAMPLE_BYTES * SAMPLE_BYTES
 
     def part(self, begin: int, end: int) -> memoryview:
@@ -128,7 +128,7 @@ class SentenceSamples:
         self.begin = offset
 
     def trailing_silence(self, limit: int) -> int:
-        """Return how many bytes of silence the buffer ends with, at most `limit`."""
+        """Return how many bytes at the end of the buffer are silent, at most `limit`."""
         return min(self._quiet, limit, len(self._kept))
 
 
@@ -156,7 +156,7 @@ class PlayerFeed:
         self.progress_at = time.monotonic()
         self._rate = rate
         self._clock = clock
-        #: time at which the stream began, moved by the time in which the player had nothing to play
+        #: time at which the stream began, plus the time for which the player had nothing to play
         self._began_at = 0.0
         #: time at which everything written will have been heard
         self._heard_at = 0.0
@@ -165,7 +165,7 @@ class PlayerFeed:
         clock.reset(begin)
 
     def offer(self, samples: memoryview) -> int:
-        """Offer samples to the player, update the timing, and return the number of bytes accepted.
+        """Offer samples to the player and update the timing. Return the number of bytes accepted.
 
         The first samples start the clock.
         """
@@ -181,7 +181,7 @@ class PlayerFeed:
         return taken
 
     def offer_silence(self, position: float, max_bytes: int | None = None) -> int:
-        """Offer silence before a position in the audio, and return the number of bytes accepted.
+        """Offer silence to the player before a position in the audio. Return the number of bytes accepted.
 
         Args:
             position: position in the audio of the next sample, in seconds.
@@ -211,11 +211,11 @@ class PlayerFeed:
             self._clock.limit_elapsed(now, max(0.0, self._seconds(consumed) - MIN_PLAYER_BUFFER_S))
 
     def buffered(self, now: float) -> float:
-        """Return how many seconds of sound were written but not heard yet."""
+        """Return how many seconds of sound have been written but not heard yet."""
         return max(0.0, self.time_left(self.written, now))
 
     def time_left(self, byte_count: int, now: float) -> float:
-        """Return the seconds until the first `byte_count` bytes have been heard.
+        """Return the number of seconds until the first `byte_count` bytes have been heard.
 
         The result is negative if they have already been heard.
         """
@@ -301,7 +301,7 @@ class Playback:
     def begin(self, rate: int, voice: str, fallback_reason: str | None = None) -> None:
         """Set the sample rate, report the voice, and start a player unless speech is paused.
 
-        A player that writes to a file is started later. Another player starts in 1 to 15 ms, while the synthesizer
+        A player that writes to a file is started later. Any other player starts in 1 to 15 ms, while the synthesizer
         produces the first samples. `write` raises its errors.
 
         Args:
@@ -331,7 +331,7 @@ class Playback:
         self._clock.add(TimedWord(self._part_start + start, length, self._seconds(self._part_begin) + position))
 
     def write(self, samples: bytes) -> None:
-        """Send samples to the player, and wait until it has accepted them. Hold back silence.
+        """Send samples to the player, and wait until it has accepted them. Hold back silence at the end.
 
         If all samples so far are silent, they are stored until the first sound follows.
         """
@@ -380,7 +380,7 @@ class Playback:
         self._wait(until=until)
 
     def finish(self) -> float:
-        """Play the sentence to its end, and return its length in seconds.
+        """Play the sentence to its end. Return its length in seconds.
 
         If any part of the sentence wasn't heard, this method raises CannotSpeak.
         """
@@ -395,7 +395,7 @@ class Playback:
         return self._seconds(self._sent - self._skipped)
 
     def heard(self) -> float:
-        """Return how many seconds of the sentence were heard, including the part that a file has received."""
+        """Return how many seconds of the sentence were heard or written to a file."""
         if self._heard is not None:
             return self._heard
         if not self._rate:
@@ -436,10 +436,10 @@ class Playback:
     # -- choosing a player
 
     def _with_player(self, step: Callable[[PlayerFeed], None]) -> None:
-        """Call `step` with a player, and again with the next player if that one fails.
+        """Call `step` with a player. If the player fails, try the next one.
 
-        If the player fails or was released, call `step` with the next player. The call is repeated if the player fails
-        before any sound was heard, or was released during a pause.
+        The next player is tried only if no sound was heard yet, or if the sentence is paused. If the player was
+        released during a pause, a new one is opened.
         """
         while True:
             self._raise_if_stopped()
@@ -466,7 +466,7 @@ class Playback:
         return PlayerFeed(player, self._rate, self._clock, self._seconds(self._begin), lead_in)
 
     def _handle_player_error(self, error: CannotSpeak) -> None:
-        """Release a failed player, or raise an error if no other can replace it.
+        """Release a failed player. Raise an error if no other player can replace it.
 
         There is no replacement if some of the sound may have been heard, or if no other player is left.
         """
@@ -496,20 +496,20 @@ class Playback:
         return time.monotonic() < self._busy_until
 
     def _replace_player(self, resume_at: int) -> None:
-        """Kill the player, so that the best one continues the sentence at the offset `resume_at`."""
+        """Kill the player. The best available player then continues the sentence at `resume_at`."""
         self._begin = self._sent = resume_at
         self._untried = self._first_error = None
         self.silence()
 
     def _release_and_rewind(self, feed: PlayerFeed) -> None:
-        """Kill a player, so that the next one repeats the sound that was not heard."""
+        """Kill a player, and rewind the sentence to the first sound that may not have been heard."""
         feed.update(time.monotonic(), all_written=False)
         self._replace_player(self._unheard_begin() if feed.player.proven else self._begin)
 
     # -- steps
 
     def _send_all(self, feed: PlayerFeed) -> None:
-        """Send the player all samples except held-back silence. Play silence while paused."""
+        """Send all samples to the player, except held-back silence. Play silence during a pause."""
         if feed.written == 0:
             feed.progress_at = time.monotonic()  # until now, the player had nothing to play
         while True:
@@ -529,7 +529,11 @@ class Playback:
                 raise CannotSpeak(Reason.AUDIO_STALLED, f"{feed.player.name} accepted no sound for {limit:g} s")
 
     def _await_samples(self, feed: PlayerFeed, interests: Sequence[Interest] = (), until: float = NEVER) -> None:
-        """Keep playing until a descriptor is ready, time is up or the player needs attention."""
+        """Offer any unsent samples. Then wait once for the player, a descriptor or the time limit.
+
+        This is called while the next samples or more text are late, so the player doesn't count as stalled. If the
+        sentence is paused, the method first plays silence until the pause ends.
+        """
         if self._runner.hold_number:
             self._keep_silent(feed)
         feed.player.ended()  # check for a failure here, because the wait below doesn't report it
@@ -564,10 +568,10 @@ class Playback:
     # -- samples
 
     def _skip_leading_zeros(self) -> bool:
-        """Skip silence before the first sound, or return False if it is too early to decide.
+        """Skip silence before the first sound. Return False if it is too early to decide.
 
-        Zeros before the first sound are skipped, so that it is heard earlier. They are kept in a file. They are also
-        kept after another sentence, because they are part of the silence between the two sentences.
+        Zeros before the first sound are skipped, so that the sentence is heard earlier. They are kept in a file. They
+        are also kept after another sentence, because they are part of the silence between the two sentences.
         """
         if self._start_known:
             return True
@@ -583,7 +587,7 @@ class Playback:
         return True
 
     def _offer_next(self, feed: PlayerFeed) -> int:
-        """Offer initial silence or the next samples, and return the number of bytes accepted."""
+        """Offer initial silence or the next samples to the player. Return the number of bytes accepted."""
         if feed.lead_in:
             taken = feed.offer_silence(self._seconds(self._begin), feed.lead_in)
             feed.lead_in -= taken
@@ -605,7 +609,7 @@ class Playback:
         return self._samples.trailing_silence(unsent) == unsent
 
     def _sendable_end(self, feed: PlayerFeed) -> int:
-        """Return the offset up to which samples may be sent for now.
+        """Return the offset up to which samples may be sent now.
 
         Silence at the end is held back, because it is shortened if another goal is waiting.
         """
@@ -694,7 +698,7 @@ class Playback:
             now = time.monotonic()
 
     def _offer_silence(self, feed: PlayerFeed) -> int:
-        """Offer silence to the player unless it has enough, and return the number of bytes accepted.
+        """Offer silence to the player unless it has enough. Return the number of bytes accepted.
 
         Without this limit, some players would accept silence endlessly.
         """
@@ -710,9 +714,9 @@ class Playback:
     # -- waiting
 
     def _wait_for_continue(self) -> None:
-        """Confirm the pause, and wait until the sentence continues.
+        """If the sentence is paused, confirm the pause and wait until it ends.
 
-        There is no player meanwhile.
+        No player is open during the wait.
         """
         while self._runner.hold_number:
             self._runner.confirm_hold()

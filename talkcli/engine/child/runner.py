@@ -139,11 +139,11 @@ class ActiveGoal:
             self.growing_text.end()
 
     def _remove_markdown(self, text: str, *, ended: bool) -> str:
-        """Return the text that is newly readable, without Markdown. Plain text stays unchanged."""
+        """Return the newly completed text without Markdown. Plain text is returned unchanged."""
         return self._markdown.read(text, ended=ended) if self._markdown else text
 
     def speech_seconds(self, now: float) -> float:
-        """Return how many seconds a third-party driver has spoken the goal, without pauses."""
+        """Return how long a third-party driver has spoken the goal, in seconds without pauses."""
         return self.spoken_s + (now - self.resumed_at if self.with_driver else 0.0)
 
 
@@ -304,7 +304,7 @@ class GoalRunner:
 
     @property
     def growing_text(self) -> GrowingText | None:
-        """The text of the current goal, or None if it does not grow."""
+        """The text of the current goal, or None if it doesn't grow."""
         return self._goal.growing_text if self._goal else None
 
     def report_text_missing(self, missing: bool) -> None:
@@ -480,7 +480,7 @@ def _make_markdown_reader() -> MarkdownReader:
 
 
 def _make_growing_text(text_so_far: str, command: protocol.Speak) -> GrowingText:
-    """Create a GrowingText, without an incomplete last sentence if the sender broke off."""
+    """Create a GrowingText. If the sender broke off, leave out an incomplete last sentence."""
     from talkcli.engine.child.cutting import GrowingText  # rarely needed, and slow to import
 
     text = GrowingText(text_so_far, ended=False)

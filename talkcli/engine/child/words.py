@@ -1,4 +1,4 @@
-"""Finds the words of a sentence, and determines when each of them is heard.
+"""Code that finds the words of a sentence, and determines when each word is heard.
 
 Nothing here reads the clock. All times are arguments, in monotonic seconds.
 """
@@ -23,8 +23,8 @@ _END_MARKS = ".,;:!?…"
 def count_letters(text: str, start: int) -> int:
     """Count the letters, digits and combining accents that begin at `start`.
 
-    It is used as the length of a word if libespeak-ng reports a length of 0. libespeak-ng does so if the next character
-    isn't ASCII (as in "«hello»"), and also if there is no word at all.
+    The result is used as the length of a word if libespeak-ng reports a length of 0. libespeak-ng does so if the next
+    character isn't ASCII (as in "«hello»"), and also if there is no word at all.
     """
     end = start
     while 0 <= end < len(text) and (text[end].isalnum() or unicodedata.category(text[end]).startswith("M")):
@@ -37,7 +37,7 @@ class WordFinder:
 
     Synthesizers repeat locations, go back, report blanks, return lengths that extend into the next word, and report
     only the first part of "it's". `find` returns each word at most once, in the order of the text. If two words are
-    spoken as one ("in the"), it returns only the first. The end of the pair is only known at the next report.
+    spoken as one ("in the"), it returns only the first. The end of the pair isn't known until the next report.
     """
 
     def __init__(self, text: str) -> None:
@@ -71,7 +71,7 @@ class WordFinder:
         return start, self._end, self._count
 
     def _whole_end(self, start: int, end: int) -> int:
-        """Return the end of a word, given the reported part of it."""
+        """Return the end of a whole word, given the part of it that was reported."""
         text = self._text
         if end == len(text) or text[end].isspace():
             return start + len(text[start:end].rstrip(_END_MARKS) or text[start:end])

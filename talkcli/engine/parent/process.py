@@ -1,4 +1,4 @@
-"""Starts an engine process, exchanges messages with it, and kills it.
+"""Classes that start an engine process, exchange messages with it, and kill it.
 
 `EngineProcess` never blocks for long and makes no decisions, so that the supervisor can use it in an event loop.
 `PrivateEngine` is for callers that have only a few texts and can block until each of them is spoken.
@@ -103,7 +103,7 @@ class EngineProcess:
         self.send(configure)
 
     def send(self, command: protocol.Command) -> bool:
-        """Send a command without blocking, and return whether it was sent."""
+        """Send a command without blocking. Return whether it was sent."""
         line = protocol.encode(command)
         try:
             return self.socket.send(line) == len(line)
@@ -133,7 +133,7 @@ class EngineProcess:
             yield event
 
     def read_stderr(self) -> bool:
-        """Report new lines from standard error, and return whether it is still open."""
+        """Report new lines from the process's standard error. Return whether it is still open."""
         try:
             data = os.read(self.stderr, 65536)
         except BlockingIOError:
@@ -163,7 +163,7 @@ class EngineProcess:
             kill_holders(self.liveness)
 
     def describe_exit(self) -> str:
-        """Kill the process if it still runs, and return a description of how it exited."""
+        """Kill the process if it is still running. Return a description of how it exited."""
         wait_ready({self.liveness: select.POLLIN}, _EXIT_WAIT_S)  # macOS doesn't report a closed end without POLLIN
         self.kill()  # must happen before the process is reaped, because its group ID may be reused afterwards
         try:
@@ -248,7 +248,7 @@ class PrivateEngine(contextlib.AbstractContextManager["PrivateEngine"]):
         self._process.send(command)  # if this fails, `wait_for` raises an error
 
     def wait_for(self, event_class: type[_E]) -> _E:
-        """Wait for the next event of the given class, and return it.
+        """Wait for the next event of the given class. Return the event.
 
         Raises:
             EngineFailed: the process failed, or exceeded a time limit.
@@ -258,7 +258,7 @@ class PrivateEngine(contextlib.AbstractContextManager["PrivateEngine"]):
         return next(event for event in self.events if isinstance(event, event_class))
 
     def _receive_events(self) -> Iterator[protocol.Event]:
-        """Yield the events of the process, and raise an error if it fails or takes too long."""
+        """Yield the events of the process. Raise an error if the process fails or takes too long."""
         process = self._process
         watched = {process.socket.fileno(): select.POLLIN, process.stderr: select.POLLIN}
         while True:

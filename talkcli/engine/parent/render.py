@@ -1,4 +1,4 @@
-"""Rendering text to a WAV file, for `say -o`.
+"""Code that renders text to a WAV file, for `say -o`.
 
 A rendering uses its own engine process and needs no server. It is not a goal: it isn't queued, other clients don't see
 it, and the text may have any length.
@@ -78,7 +78,7 @@ def render(
     interrupt: Mapping[int, int] | None = None,
     **sound: Any,
 ) -> float:
-    """Render a text to a WAV file, and return the length of the audio in seconds.
+    """Render a text to a WAV file. Return the length of the audio in seconds.
 
     Args:
         text: the text, of any length.
@@ -145,7 +145,7 @@ def split_into_pieces(text: str) -> Iterator[str]:
 
 
 def _speak_all(engine: PrivateEngine, commands: Iterator[protocol.Speak], engine_path: str, shown_path: str) -> float:
-    """Render all pieces of the text, and return the length of the audio in seconds.
+    """Render all pieces of the text. Return the length of the audio in seconds.
 
     Args:
         engine: the engine process.
@@ -175,7 +175,7 @@ def _speak_all(engine: PrivateEngine, commands: Iterator[protocol.Speak], engine
 
 
 def _convert_engine_error(error: EngineFailed, speaking_voice: str | None) -> RenderFailed:
-    """Convert an EngineFailed to a RenderFailed that names the voice that was speaking."""
+    """Convert an EngineFailed to a RenderFailed, and name the voice that was speaking."""
     while_speaking = "" if speaking_voice is None else f' while it spoke with the voice "{speaking_voice}"'
     if error.reason == Reason.ENGINE_CRASHED:
         return RenderFailed(error.reason, f"the engine crashed{while_speaking}: {error}")
@@ -221,7 +221,7 @@ def _is_stream(path: str) -> bool:
 
 @contextlib.contextmanager
 def _open_output(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> Iterator[int]:
-    """Open standard output, a pipe or a device in a `with` block. Refuse a terminal."""
+    """Open standard output, a pipe or a device for a `with` block, but refuse a terminal."""
     output_fd = os.dup(1) if path in STANDARD_OUTPUT else _open_pipe_or_device(path, deadline, interrupt)
     try:
         if os.isatty(output_fd):
@@ -235,7 +235,7 @@ def _open_output(path: str, deadline: float, interrupt: Mapping[int, int] | None
 
 
 def _open_pipe_or_device(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> int:
-    """Open a device, or a named pipe once it has a reader, and return the descriptor."""
+    """Open a device, or a named pipe once it has a reader. Return the descriptor."""
     while True:
         try:
             return os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
@@ -283,7 +283,7 @@ def _hidden_file(path: str) -> Iterator[str]:
 
 
 def _resolve_target(path: str) -> str:
-    """Return the path of the file to replace, with links resolved, or raise CannotWrite.
+    """Return the path of the file to replace, with links resolved.
 
     Raises:
         CannotWrite: the path can't be replaced with a file.

@@ -115,7 +115,7 @@ class RestartPolicy:
     """Decides when to start the next engine process, and whether goals wait for it.
 
     Goals wait while the cause may be temporary, such as a lack of memory or descriptors. A permanent cause, such as a
-    missing library or an unknown driver, fails each goal at once, until a process does become ready.
+    missing library or an unknown driver, fails each goal at once, until a process becomes ready.
 
     The class never reads the clock. All times are arguments, in monotonic seconds.
     """
@@ -140,9 +140,9 @@ class RestartPolicy:
             self._back_off(now)
 
     def start_failed(self, now: float, started_at: float, permanent_error: str | None) -> bool:
-        """Schedule the next start after a failed one, and return whether goals must fail now.
+        """Schedule the next start after a failed one. Return whether waiting goals must fail now.
 
-        That is so if goals have waited too long for an engine.
+        They must fail if they have waited too long for an engine.
 
         Args:
             now: the current time.
@@ -260,7 +260,7 @@ class Supervisor:
     def load(self, voice: str) -> None:
         """Load a neural voice if an engine process is ready.
 
-        `VoiceLoaded` is posted when it has finished or failed.
+        `VoiceLoaded` is posted when loading has finished or failed.
         """
         self._actions.call(lambda: self._load_voice(voice))
 
@@ -365,7 +365,7 @@ class Supervisor:
         return self._goal if self._goal and self._goal.command.id == goal_id else None
 
     def _begin_goal(self, command: protocol.GoalCommand) -> None:
-        """Make this the current goal, and send it, or fail it if no process can start."""
+        """Make this the current goal. Send it to the process, or fail it if no process can start."""
         self._goal = SupervisedGoal(command)
         if self._restarts.permanent_error is not None:
             self._fail_goal(self._goal, Reason.ENGINE_FAILED, self._restarts.permanent_error)
@@ -388,7 +388,10 @@ class Supervisor:
             self._loading, self._last_sign_at = voice, time.monotonic()
 
     def _send(self, command: protocol.Command) -> bool:
-        """Send a command to a ready process, or kill it if it refuses. Return whether it was sent."""
+        """Send a command to the process if it is ready. Return whether it was sent.
+
+        A process that doesn't accept commands is killed.
+        """
         process = self._process
         if process is None or not process.ready:
             return False
@@ -551,7 +554,7 @@ class Supervisor:
             self._handle_failed_start(message, permanent=failure is not None and failure.permanent)
 
     def _handle_lost_goal(self, goal: SupervisedGoal, process: EngineProcess, message: str, reason: Reason) -> None:
-        """Prepare a goal without a process for a retry, or for its end once the process exits.
+        """Handle a goal whose process was lost. Retry the goal, or end it once the process has exited.
 
         If the process crashed before it started the goal, nothing was heard, so the goal is sent to the next process.
         Each goal is retried only once.
@@ -568,9 +571,9 @@ class Supervisor:
         goal.sent, goal.stop_due, goal.hold_due = False, NEVER, NEVER
 
     def _handle_failed_start(self, message: str, *, permanent: bool = False) -> None:
-        """Schedule another start, and fail the waiting goal if it can't wait longer.
+        """Schedule another start. Fail the waiting goal if it can't wait any longer.
 
-        Fail the waiting goal if the error is permanent or the goal has waited too long.
+        It can't wait if the error is permanent or the goal has waited too long.
         """
         ends_goal = self._restarts.start_failed(time.monotonic(), self._started_at, message if permanent else None)
         waiting = self._goal if self._goal and not self._goal.end else None

@@ -49,8 +49,8 @@ class CannotEnd(Exception):
 class Player(Protocol):
     """The interface of a player, which plays the samples of one sentence.
 
-    The constructor raises CannotSpeak (`no_player` or `audio_device`) if the output can't be opened, and leaves nothing
-    open then. After that, the playback calls the player from a single thread:
+    The constructor raises CannotSpeak (`no_player` or `audio_device`) if the output can't be opened, and then leaves
+    nothing open. After that, the playback calls the player from a single thread:
 
     1. It calls `offer` until there are no more samples, then `close` once, then `ended` until it returns True. It may
        read `consumed` and `proven` at any time, and it calls `interests` and `wake_at` right before each wait.
@@ -80,7 +80,7 @@ class Player(Protocol):
         return None
 
     def offer(self, data: memoryview) -> int:
-        """Accept as many samples as there is room for, and return the number of bytes accepted.
+        """Accept as many samples as there is room for. Return the number of bytes accepted.
 
         Args:
             data: Between one byte and one piece of samples. The caller reuses this buffer after the call.

@@ -106,7 +106,7 @@ class NullPlayer(BuiltInPlayer):
         return self._closed and self._clock() >= self._end_time
 
     def wake_at(self) -> float:
-        """Return when the simulated buffer has room or, after `close`, is empty."""
+        """Return when the simulated buffer will have room. After `close`, return when it will be empty."""
         # At this time, a third of the buffer is free, so this player wakes up no more often than a real one.
         return self._end_time if self._closed else self._end_time - NULL_AHEAD_S * 2 / 3
 
@@ -140,7 +140,7 @@ class WavPlayer(BuiltInPlayer):
             opened.pop_all()
 
     def offer(self, data: memoryview) -> int:
-        """Write the samples to the file, and return the number of bytes written."""
+        """Write the samples to the file. Return the number of bytes written."""
         if self._closed:
             return 0
         end = self._start + self._taken
@@ -193,7 +193,7 @@ class WavStreamPlayer(BuiltInPlayer):
         self._header = _WAV_HEADER.pack(*_header_fields(rate, _UNKNOWN_BYTES)) if first else b""
 
     def offer(self, data: memoryview) -> int:
-        """Write the samples if the output has room, and return the number of bytes written."""
+        """Write the samples if the output has room. Return the number of bytes written."""
         # A writable pipe has room for at least a header and a piece of samples.
         if not wait_ready({self._output: select.POLLOUT}, 0.0):
             return 0
@@ -223,7 +223,7 @@ def _convert_os_errors(reason: Reason, subject: str) -> Iterator[None]:
 
 
 def _open_regular_file(path: str) -> int:
-    """Open a file for reading and writing, and return its descriptor.
+    """Open a file for reading and writing. Return its descriptor.
 
     Create the file if it doesn't exist.
 
@@ -241,14 +241,14 @@ def _open_regular_file(path: str) -> int:
 
 
 def _header_fields(rate: int, sample_bytes: int) -> tuple[bytes | int, ...]:
-    """Return the fields of a WAV header, given the length of the samples."""
+    """Return the fields of a WAV header for samples of this rate and size."""
     audio_format = (1, 1, rate, rate * SAMPLE_BYTES, SAMPLE_BYTES, 8 * SAMPLE_BYTES)  # PCM, one channel
     riff_bytes = min(_UNKNOWN_BYTES, _RIFF_HEADER_BYTES + sample_bytes)
     return b"RIFF", riff_bytes, b"WAVE", b"fmt ", 16, *audio_format, b"data", sample_bytes
 
 
 def _read_sample_bytes(file: int, path: str, rate: int) -> int:
-    """Check the WAV header of a file, and return its number of sample bytes.
+    """Check the WAV header of a file. Return the number of sample bytes in the file.
 
     Raises:
         CannotSpeak: The file wasn't written by a `WavPlayer` with this sample rate.

@@ -1,4 +1,4 @@
-"""Chooses a player for each sentence, according to `--player` and `--device`.
+"""Code that chooses a player for each sentence, according to `--player` and `--device`.
 
 Every sentence gets its own player. If a player fails, the playback decides whether to try the next one.
 """
@@ -173,7 +173,7 @@ class PlayerChooser:
     def find_first_player(self) -> str | None:
         """Return the name of the player that would be tried first, or None if there is none.
 
-        To test the players that run in this process, open and close them.
+        Players that run in this process are opened and closed to test them.
         """
         if self._configure.output_fd is not None:
             return WavStreamPlayer.name

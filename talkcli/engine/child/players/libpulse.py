@@ -193,7 +193,7 @@ class MainLoop:
         self.freed = False
 
     def iterate(self) -> bool:
-        """Run one iteration without waiting, and return whether it did any work."""
+        """Run one iteration without waiting. Return whether it did any work."""
         # If the second argument is 1, libpulse tells `_poll` how long it is until the next timer.
         return not self.freed and bool(self._library.mainloop_iterate(self._pointer, 1, None) > 0)
 

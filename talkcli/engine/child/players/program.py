@@ -114,7 +114,7 @@ class PlayerProcess:
             self.exit = io.FileIO(os.pidfd_open(self.pid))
 
     def poll(self) -> int | None:
-        """Return the exit status, or None while running. After the exit, kill leftover processes.
+        """Return the exit status, or None while the program runs. After its exit, kill leftover processes.
 
         This also reaps the program. If a signal killed it, the status is the negative number of the signal. The program
         counts as running until all processes that it has started have exited.
@@ -160,7 +160,7 @@ class PlayerProcess:
 
 
 def _spawn(argv: tuple[str, ...], stdin: int, stderr: int, inherited: Sequence[int]) -> int:
-    """Start the program and return its process ID.
+    """Start a program. Return its process ID.
 
     The `inherited` descriptors are inheritable only during the call.
     """
@@ -262,7 +262,7 @@ class ProgramPlayer(Player):
         self._write(memoryview(command.preamble))
 
     def offer(self, data: memoryview) -> int:
-        """Write samples if the program has read all earlier ones, and return the bytes written."""
+        """Write samples if the program has read all earlier ones. Return the number of bytes written."""
         self.ended()  # raises CannotSpeak if the program has exited
         stdin = self._process.stdin
         if stdin.closed:
@@ -327,7 +327,7 @@ class ProgramPlayer(Player):
         return True
 
     def _write(self, data: memoryview) -> int:
-        """Write to the program without blocking, and return the number of bytes written.
+        """Write to the program without blocking. Return the number of bytes written.
 
         If the program has closed its input, return 0, and allow it a short time to exit.
         """

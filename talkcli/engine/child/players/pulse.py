@@ -125,7 +125,7 @@ class PulsePlayer(Player):
     # -- the interface `Player`
 
     def offer(self, data: memoryview) -> int:
-        """Write as many samples as the server has room for, and return the number of bytes written."""
+        """Write as many samples as the server has room for. Return the number of bytes written."""
         self._run_and_check()
         length = min(len(data), self._room())
         if length == 0:
@@ -170,7 +170,7 @@ class PulsePlayer(Player):
         return self._loop.interests
 
     def wake_at(self) -> float:
-        """Run libpulse, and return when it needs to run again.
+        """Run libpulse. Return when it needs to run again.
 
         The result is 0, which means now, if the server has room for samples. It is also 0 after each report of the
         playback time, because words may be due.
@@ -225,7 +225,7 @@ class PulsePlayer(Player):
             pass
 
     def _advance_stream(self) -> bool:
-        """Take the stream's next step, and return whether libpulse may have more work."""
+        """Check the connection and advance the stream. Return whether libpulse may have more work."""
         if self._error is not None or self._drained:
             return False
         state = self._lib.context_get_state(self._context)
@@ -250,7 +250,7 @@ class PulsePlayer(Player):
         return False
 
     def _open_stream(self) -> bool:
-        """Create the stream and connect it to a sink, or return False if it can't be created."""
+        """Create the stream and connect it to a sink. Return False if the stream can't be created."""
         buffered, request = (each * self._rate // 1000 * SAMPLE_BYTES for each in (BUFFER_MS, REQUEST_MS))
         # The server starts playing once the buffer is full. If it started with the first piece, it would run out of
         # samples before the second, and would have to rewind. Some sinks can't rewind.
@@ -270,7 +270,7 @@ class PulsePlayer(Player):
         return True
 
     def _follow_sink(self) -> bool:
-        """Respond to a change or suspension of the sink, and return whether requests were sent."""
+        """React if the sink was changed or suspended. Return whether requests were sent."""
         index = int(self._lib.stream_get_device_index(self._stream))
         changed = index != self._sink_index
         if changed:
@@ -298,7 +298,7 @@ class PulsePlayer(Player):
         return changed
 
     def _request_time(self) -> bool:
-        """Request the playback time if it is due, and return whether a request was sent."""
+        """Request the playback time if a request is due. Return whether it was sent."""
         if time.monotonic() < self._time_request_at:
             return False
         self._time_request_at = NEVER
@@ -313,7 +313,7 @@ class PulsePlayer(Player):
         self._release(self._lib.context_get_sink_input_info(self._context, stream, self._stream_callback, None))
 
     def _release(self, operation: int | None) -> None:
-        """Release the handle of an operation, which keeps running."""
+        """Release the handle of an operation. The operation itself keeps running."""
         if operation is not None:
             self._lib.operation_unref(operation)
 

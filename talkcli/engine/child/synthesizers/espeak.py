@@ -88,7 +88,7 @@ def _events_of(pointer: Any) -> Iterator[_EspeakEvent]:
 
 
 def load_library() -> tuple[Any, str, int]:
-    """Initialize libespeak-ng, and return its binding, its version and the sample rate.
+    """Initialize libespeak-ng. Return its binding, its version and the sample rate.
 
     The library of the system is preferred. If it is missing, the library from the package espeakng-loader is used. Call
     this once per process, before anything imports `pyttsx3.drivers._espeak`, which also loads the library.
@@ -120,7 +120,7 @@ def load_library() -> tuple[Any, str, int]:
 
 
 def _preload_library() -> tuple[str, bytes | None]:
-    """Load libespeak-ng, and return where it came from and the directory of its data."""
+    """Load libespeak-ng. Return where it was found, and the directory of its data if it is known."""
     try:
         ctypes.CDLL(_LIBESPEAK)
         return "system", None
@@ -306,7 +306,7 @@ class EspeakPhonemizer:
         self._to_phonemes.restype = ctypes.c_char_p
 
     def clauses(self, text: str) -> list[tuple[str, str]]:
-        """Split a text into clauses, and return each clause with its phonemes in IPA."""
+        """Split a text into clauses. Return each clause with its phonemes in IPA."""
         # The library reads ahead, and any other call discards that text. So get all clauses before doing anything else.
         raw = ctypes.create_string_buffer(guard.guarded(text, self._voice).encode("utf-8", "replace"))
         base = ctypes.addressof(raw)

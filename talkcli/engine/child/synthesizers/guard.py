@@ -86,9 +86,9 @@ _SEPARATE_DIGITS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def guarded(text: str, voice: str = "") -> str:
-    """Return a text in which the characters that crash libespeak-ng are replaced.
+    """Replace characters that would crash libespeak-ng.
 
-    Its length stays the same.
+    The length of the text stays the same.
 
     Args:
         text: The text to make safe.
@@ -110,7 +110,7 @@ def _unsafe_characters(language: str) -> re.Pattern[str]:
 
 
 def _split_number(number: str, min_digits: int, max_digits: int) -> str:
-    """Split a number with a superscript digit if it has `min_digits` to `max_digits` digits."""
+    """Split a number of `min_digits` to `max_digits` digits by making one digit a superscript."""
     if not min_digits <= sum(map(str.isdigit, number)) <= max_digits:
         return number
     middle = next(place for place in range(len(number) // 2, len(number)) if number[place].isdigit())
@@ -118,7 +118,7 @@ def _split_number(number: str, min_digits: int, max_digits: int) -> str:
 
 
 def _without_long_initials(text: str) -> str:
-    """Return a text in which the dots in long sequences of initials are blanks."""
+    """Replace the dots in long sequences of initials with blanks."""
     result = list(text)
     looked_up = spelled = words = size = 0
     dots: list[int] = []
@@ -172,14 +172,14 @@ def _utf8_bytes(text: str) -> int:
 
 
 def _max_bytes(character: str) -> int:
-    """Return the most bytes that the library may need for a character."""
+    """Return the maximum number of bytes that the library may need for a character."""
     if _HANGUL <= character <= _HANGUL_END:
         return 9
     return max(2, _utf8_bytes(character), _utf8_bytes(character.lower()))
 
 
 def _blank_crashing_hyphens(text: str) -> str:
-    """Replace the hyphens that would crash the library with blanks.
+    """Replace hyphens with blanks if they would crash the library.
 
     The library doesn't mark the beginning of the word after such a hyphen. Later, it looks for the mark and reads
     beyond the start of its list of phonemes. This crashes Vietnamese, Danish, Hindi and other voices.
@@ -195,9 +195,9 @@ def _blank_crashing_hyphens(text: str) -> str:
 
 
 def _split_word(match: re.Match[str]) -> str:
-    """Return the matched word, changed so that it isn't too long for the library.
+    """Split a matched word if it is too long for the library or has too many apostrophes.
 
-    Apostrophes become blanks, or pairs of letters get another case.
+    The length stays the same: apostrophes become blanks, or pairs of letters change case.
     """
     word = match.group(1) or ""
     # If a script has no capital letters, its words can only be split at apostrophes.

@@ -87,7 +87,7 @@ class ModelCache:
         self._directory = directory
 
     def find(self, key: str) -> tuple[str, str]:
-        """Return the paths of the encoder and the decoder, and mark them as used.
+        """Return the paths of a cached encoder and decoder, and mark both as used.
 
         Raises:
             OSError: One of them isn't cached.
@@ -98,7 +98,7 @@ class ModelCache:
         return paths
 
     def store(self, key: str, make_encoder: Callable[[str | None], Any], decoder_content: Iterable[Buffer]) -> Any:
-        """Create and return the encoder of a model, and cache both halves if possible.
+        """Create the encoder of a model, and cache both halves if possible. Return the encoder.
 
         Args:
             key: The key of the model.
@@ -124,11 +124,11 @@ class ModelCache:
         return made
 
     def _cached_path(self, key: str, suffix: str) -> str:
-        """Return the path at which a half of a model is cached."""
+        """Return the cache path for one half of a model."""
         return os.path.join(self._directory, key + suffix)
 
     def _shrink(self) -> None:
-        """Remove old files if the cache is too large, and leftover temporary directories."""
+        """Remove leftover temporary directories, and old files if the cache is too large."""
         size = 0
         with contextlib.suppress(OSError):  # Another process may be removing the same files.
             cached = [each for each in os.scandir(self._directory) if _CACHED_NAME.fullmatch(each.name)]
@@ -234,7 +234,7 @@ class Model:
         return Frames(tuple(values), tuple(int(each) for each in np.cumsum(durations)))
 
     def decode(self, frames: Frames, begin: int, end: int, run: ModelRun) -> Any:
-        """Decode a range of frames, and return their samples as floats.
+        """Decode a range of frames. Return their samples as floats.
 
         Raises:
             VoiceFileError: The model is faulty, or the run was ended.
@@ -242,7 +242,7 @@ class Model:
         import numpy as np
 
         low, high = max(0, begin - CONTEXT_FRAMES), min(frames.count, end + CONTEXT_FRAMES)
-        # If a value doesn't have one item per frame, it applies to the whole sentence, such as the speaker.
+        # Values without one item per frame, such as the speaker, apply to the whole sentence.
         parts = {
             name: each[..., low:high] if each.shape[-1:] == (frames.count,) else each
             for name, each in zip(self._frame_inputs, frames.values, strict=True)
@@ -279,7 +279,7 @@ class Model:
         self._samples_per_frame = self._test_model()
 
     def _run_half(self, half: Any, inputs: dict[str, Any], run: ModelRun) -> list[Any]:
-        """Run the encoder or the decoder, and return its outputs."""
+        """Run the encoder or the decoder. Return its outputs."""
         try:
             found: list[Any] = half.run(None, inputs, run.options)
         except Exception as error:
@@ -287,7 +287,7 @@ class Model:
         return found
 
     def _test_model(self) -> int:
-        """Test the model with one phoneme, and return the number of samples per frame."""
+        """Test the model with one phoneme. Return the number of samples per frame."""
         ids = self.description.phoneme_ids
         highest = max(each for every in ids.values() for each in every)
         phonemes = [*ids[BEGIN_SYMBOL], *ids[PAD_SYMBOL], highest, *ids[PAD_SYMBOL], *ids[END_SYMBOL]]
@@ -328,7 +328,7 @@ def load_libraries(model_path: str) -> None:
 
 
 def _split_and_cache(path: str, content: bytes, cache: ModelCache | None, key: str) -> tuple[Any, Any]:
-    """Split and cache a model, and return a session for each half.
+    """Split a model and cache its halves. Return a session for each half.
 
     Raises:
         VoiceFileError: The model can't be split or loaded.
@@ -347,7 +347,7 @@ def _split_and_cache(path: str, content: bytes, cache: ModelCache | None, key: s
 
 
 def _create_half_session(half: Sequence[Buffer], save_optimized_to: str | None = None) -> Any:
-    """Create an onnxruntime session for a half of a model.
+    """Create an onnxruntime session for one half of a model.
 
     onnxruntime reads the half from a temporary file in memory. To pass bytes instead, the parts would have to be
     joined, and onnxruntime would keep a copy of them. For the voice joe, each of these steps takes 30 to 110 ms, during
@@ -373,9 +373,9 @@ def _create_session(model: str | bytes, save_optimized_to: str | None = None) ->
     options.log_severity_level = 4
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # onnxruntime's memory arena never shrinks, and isn't faster.
+    # Turn off onnxruntime's memory arena, which never shrinks and doesn't make a model faster.
     options.enable_cpu_mem_arena = options.enable_mem_pattern = False
-    # Higher levels take 0.15 s longer, the model is no faster, and the result fits only one type of processor.
+    # A higher level takes 0.15 s longer and doesn't make the model faster. Its result fits only one type of processor.
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
     if save_optimized_to is not None:
         options.optimized_model_filepath = save_optimized_to

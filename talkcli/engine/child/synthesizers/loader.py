@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     _Fingerprints = tuple[tuple[int, int, int], ...]
 
 #: After a sentence, freed memory is returned to the system only if the process has grown by at least this number of
-#: bytes. The next sentence would need smaller amounts again.
+#: bytes. Smaller amounts would be needed again for the next sentence.
 GROWTH_BYTES = 16_000_000
 
 _T = TypeVar("_T")
@@ -166,9 +166,9 @@ class ModelLoader:
             self._start_next_load()
 
     def get_model(self, voice: str) -> Model | None:
-        """Finish any complete load, and return the model of a voice, or None if it isn't loaded.
+        """Return the model of a voice, or None if it isn't loaded. Handle a finished load first.
 
-        Unload a failed voice whose files have changed.
+        If the voice has failed and its files have changed since then, unload it.
         """
         self._finish_load()
         model, fingerprints = self._models.get(voice, (None, ()))
@@ -184,12 +184,12 @@ class ModelLoader:
         The first sentences with a voice need memory that is never freed.
         """
         if voice not in self._models:
-            self._unmeasured = ""  # The voice was unloaded during the sentence, and its memory has been freed just now.
+            self._unmeasured = ""  # The voice was unloaded during the sentence, and its memory has just been freed.
         elif self._unmeasured is None:
             self._unmeasured = voice
 
     def take_events(self) -> list[VoiceLoaded | VoiceUnloaded | VoiceMemory]:
-        """Finish any complete load, measure memory if due, and return and clear the new events."""
+        """Return and clear the new events. First handle a finished load, and measure memory if due."""
         self._finish_load()
         if self._unmeasured is not None:
             self._measure_memory(self._unmeasured, min_growth=GROWTH_BYTES)
@@ -237,7 +237,7 @@ class ModelLoader:
         self._events.append(VoiceMemory(voice, self._reported_growth))
 
     def _start_next_load(self) -> None:
-        """Start loading the next voice if no other is being loaded.
+        """Start loading the next voice if no other voice is being loaded.
 
         A load keeps one processor busy, and temporarily needs twice the memory of the model.
         """

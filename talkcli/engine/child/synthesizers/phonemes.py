@@ -56,7 +56,7 @@ class Phonemizer(Protocol):
     """
 
     def clauses(self, text: str) -> list[tuple[str, str]]:
-        """Split a text into clauses, and return each clause with its phonemes in IPA."""
+        """Split a text into clauses. Return each clause with its phonemes in IPA."""
 
     def word_positions(self, clause: str) -> list[tuple[int, int]]:
         """Return the start and the length of each word in a clause. The length is at least 1."""
@@ -137,7 +137,7 @@ def _phoneme_groups(ipa: str) -> list[str]:
 
 
 def _locate_words(phonemizer: Phonemizer, clause: str, phoneme_groups: Sequence[str]) -> list[tuple[int, int, int]]:
-    """Return each word's first phoneme index, and its start and length in the clause.
+    """Return the index of each word's first phoneme, and the word's start and length in the clause.
 
     The phonemes are counted across all groups.
     """

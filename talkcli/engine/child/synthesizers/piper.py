@@ -154,9 +154,9 @@ class Piper:
             raise CannotSpeak(Reason.VOICE_FAILED, words) from error
 
     def _wait_for_model(self, voice: str, sink: SampleSink) -> Model:
-        """Return the model of a voice, after loading it if necessary.
+        """Return the model of a voice. Load the model first if necessary.
 
-        The sink keeps playing meanwhile.
+        While it loads, the sink keeps playing.
 
         Raises:
             CannotSpeak: The voice can't be loaded.

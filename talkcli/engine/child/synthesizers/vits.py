@@ -105,7 +105,7 @@ class _Reader:
         self._fields_left = _MAX_FIELDS
 
     def fields(self, raw: Buffer) -> list[Field]:
-        """Parse a protobuf message, and return its fields. Raise NotSplit if it is invalid."""
+        """Parse a protobuf message. Return its fields, or raise NotSplit if it is invalid."""
         found = []
         at, end = 0, len(raw)
         while at < end:
@@ -152,7 +152,7 @@ class _Node:
 
 
 class _Graph:
-    """A model's graph of operations, with its weights."""
+    """A model's graph of operations and its weights."""
 
     def __init__(self, reader: _Reader, raw: Buffer, depth: int = 0) -> None:
         if depth > _MAX_NESTED_GRAPHS:
@@ -244,7 +244,7 @@ def _names(fields: Iterable[Field], field_number: int) -> list[str]:
 
 
 def _parse_integer(raw: Buffer, at: int) -> tuple[int, int]:
-    """Decode an integer, and return it with the index of the next byte."""
+    """Decode an integer. Return it with the index of the next byte."""
     result = shift = 0
     while at < len(raw) and shift < 64:  # Longer integers aren't valid.
         byte = raw[at]
