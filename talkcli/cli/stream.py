@@ -68,7 +68,7 @@ class StreamSpeaker(InputSpeaker):
         reporter, self._decoder = self._reporter, InputDecoder()
         self._speech = self._client.stream(feedback=self._feedback.shows_events, **self._goal_options)
         self._text = self._speech._text
-        while not (request := self._text.next_request()):
+        while not (request := self._text.request_to_send()):
             pause = partial(wait_ready, {}, seconds_left(self._end), self._interrupts.watched)
             self._add_input(self._await_input(pause, wants_input=True))
             if seconds_left(self._end) == 0:
@@ -99,7 +99,7 @@ class StreamSpeaker(InputSpeaker):
             if seconds_left(self._end) == 0:
                 raise TimeoutError
             can_write = exchange is None and not self._speech._stopped
-            if can_write and (request := self._text.next_request()):
+            if can_write and (request := self._text.request_to_send()):
                 exchange = self._connection.begin(request, self._speech._add_text)
             pause = partial(self._connection.wait_until, partial(_has_news, goal, exchange), self._end)
             wants_input = can_write and exchange is None and not self._text.ended

@@ -43,7 +43,7 @@ __all__ = ["Client", "GoalHandle"]
 _RESERVED_LINE_BYTES = 4096
 #: The maximum size of an ASCII character, such as an escaped quote, and of any other character in JSON.
 _MAX_ASCII_BYTES, _MAX_CHARACTER_BYTES = 2, 12
-#: A `seq` with more digits than that of any real request.
+#: A `seq` that has more digits than any real one.
 _LONG_SEQ = 10**15
 
 
@@ -213,7 +213,7 @@ class Client:
         feedback: bool = False,
         patient: bool = False,
     ) -> SpeechStream:
-        """Return a stream whose text is spoken while it is written.
+        """Return a stream that speaks a text while the text is being written.
 
             with talk.stream(preempt=True) as speech:
                 for token in model:
@@ -244,7 +244,7 @@ class Client:
         return SpeechStream(self._connection, say)
 
     def follow(self, ids: Iterable[str] | None = None, *, feedback: bool = False) -> list[GoalHandle]:
-        """Receive the events of goals, and return their handles.
+        """Start to receive the events of goals. Return the goals' handles.
 
         Any client may have sent the goals.
 
@@ -276,7 +276,7 @@ class Client:
         before: str | None = None,
         key: str | None = None,
     ) -> Canceled:
-        """Cancel goals, and return them once they are silent.
+        """Cancel goals. Return them once they are silent.
 
         Without arguments, cancel all goals. A goal is cancelled if any of the arguments selects it.
 
@@ -313,7 +313,7 @@ class Client:
         return ServerStatus.from_reply(*self._connection.request(Status()))
 
     def goal(self, goal_id: str) -> Goal:
-        """Return a goal in its current state, or raise UnknownGoal.
+        """Return a goal in its current state. Raise UnknownGoal if the server doesn't know it.
 
         Raises:
             UsageError: the id is empty.
@@ -323,7 +323,7 @@ class Client:
         return Goal.from_json(reply.get("goal"))
 
     def log(self, count: int = 20) -> list[Goal]:
-        """Return the most recently ended goals, including REJECTED ones, with the oldest first.
+        """Return the most recently ended goals, including REJECTED ones, oldest first.
 
         Args:
             count: the maximum number of goals, 1 to 2,200. The server keeps no more than 2,200.
@@ -387,7 +387,7 @@ class Client:
         return settings if isinstance(settings, dict) else {}
 
     def pause(self) -> Goal | None:
-        """Pause all speech, and return the paused goal, if any, once it is silent.
+        """Pause all speech. Return the paused goal, if any, once it is silent.
 
         Return None if no goal was being spoken. Nothing is spoken until any client calls `resume`. Pausing twice is no
         error.
@@ -395,7 +395,7 @@ class Client:
         return goal_in(self._connection.request(Pause())[0])
 
     def resume(self) -> Goal | None:
-        """Resume speech, and return the resumed goal, if any.
+        """Resume speech. Return the resumed goal, if any.
 
         Return None if no goal was paused. Resuming twice is no error.
         """
@@ -428,7 +428,7 @@ class Client:
     # -- internal
 
     def _create_handle(self, request: Say) -> tuple[GoalHandle, OnReply]:
-        """Check a new goal, and return its handle and the function that processes the reply.
+        """Check a new goal. Return its handle, and the function that processes the reply.
 
         If the text is too long for a request, the goal is already REJECTED.
 
@@ -446,7 +446,7 @@ class Client:
         return handle, accepted
 
     def _full_id(self, goal_id: str) -> str:
-        """Check a goal id, and put the boot id in front of it if it is only a number.
+        """Check a goal id. Return it, with the boot id in front if it is only a number.
 
         Raises the same errors as `check_id`.
         """
@@ -456,7 +456,7 @@ class Client:
         return goal_id
 
     def _take_all(self, buffer: EventBuffer) -> Iterator[Event]:
-        """Yield the events of a buffer as they arrive, and raise Lost when no more can arrive."""
+        """Yield the events of a buffer as they arrive. Raise Lost when no more can arrive."""
         for event in take_repeatedly(self._connection, lambda: buffer.take() or buffer.closed, None):
             if event is None or isinstance(event, str):
                 break
@@ -484,7 +484,7 @@ def check_id(goal_id: str) -> None:
 
 
 def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
-    """Split ids into groups that fit into one request, without duplicates."""
+    """Remove duplicate ids. Return the others in groups that fit into one request."""
     groups: list[list[str]] = []
     room = 0
     for each in dict.fromkeys(ids):
@@ -512,7 +512,7 @@ def check(request: Say | Set) -> None:
 
 
 def too_long(request: Say) -> Goal | None:
-    """Return a REJECTED goal if the text is too long for a request.
+    """Return a REJECTED goal if the text is too long for a request, or None if it fits.
 
     Raises:
         UsageError: `data` has no JSON form.

@@ -26,11 +26,11 @@ if TYPE_CHECKING:
     from talkcli.client.core import ServerInfo
     from talkcli.goals.goal import JsonObject
 
-#: The beginning of the greeting of a server with the same protocol. A test compares it with a real greeting.
+#: How the greeting of a server with the same protocol begins. A test compares this with a real greeting.
 GREETING_START = b'{"talk": 1, "version": '
 #: How long to wait for the greeting of an idle server. Longer waits must be interruptible.
 GREETING_WAIT_S = 0.2
-#: Maximum time for which `yield_processor` waits.
+#: Maximum waiting time of `yield_processor`.
 _LONGEST_YIELD_S = 0.2
 #: If an answer contains one of these, the goal will not be spoken.
 _REFUSALS = (b'"ok": false', b'"state": "REJECTED"')
@@ -73,7 +73,7 @@ class ConnectionAttempt:
 def reach(
     named_path: str | None, failures: tuple[tuple[str, Exception], ...] = (), only_path: str | None = None
 ) -> ConnectionAttempt:
-    """Connect to the first usable socket, and return the attempt. Nothing is sent yet.
+    """Connect to the first usable socket without sending anything. Return the attempt.
 
     Args:
         named_path: path of the only socket to try, as the user named it; None for the usual places.
@@ -171,10 +171,7 @@ def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> None:
 
 
 def sender_name(name: str | None) -> str | None:
-    """Return the given name, or else the value of TALK_NAME.
-
-    Return None if neither is set.
-    """
+    """Return the given name, or else the value of TALK_NAME, or else None."""
     # Cancelling must work even if the variable is not valid UTF-8.
     variable = os.environ.get("TALK_NAME", "").encode(errors="surrogateescape").decode(errors="replace")
     return name or variable or None
@@ -201,7 +198,9 @@ def connect(
     keep_trying_s: float = 0.0,
     greeting_deadline: float | None = None,
 ) -> ConnectionAttempt:
-    """Connect to the first usable server, and read its greeting. Retry for a limited time.
+    """Connect to the first usable server, and read its greeting. Return the connection.
+
+    If there is no usable server, try again for a limited time.
 
     Args:
         named_path: path of the only socket to try; None for the usual places.
@@ -258,7 +257,7 @@ def _server_may_start(attempt: ConnectionAttempt) -> bool:
 def _greet(
     attempt: ConnectionAttempt, hello: JsonObject, deadline: float, interrupt: Mapping[int, int] | None
 ) -> ConnectionAttempt:
-    """Send hello if necessary, and return the attempt with the server's greeting.
+    """Send hello if necessary, and read the server's greeting. Return the updated attempt.
 
     The connection is closed if the greeting has not arrived by `deadline` (monotonic), and after any other error.
 

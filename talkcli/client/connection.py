@@ -41,10 +41,7 @@ _RECONNECT_PAUSE_S = 0.1
 
 
 def checked_sender_name(name: str | None) -> str | None:
-    """Return the given name or else TALK_NAME, or raise UsageError if it is too long.
-
-    Return None if neither is set.
-    """
+    """Return the given name, or else TALK_NAME, or else None. Raise UsageError if it is too long."""
     name = sender_name(name)
     if name and len(name) > MAX_SENDER_NAME_CHARS:
         raise UsageError(f"the sender's name is too long: {len(name)} characters (at most {MAX_SENDER_NAME_CHARS})")
@@ -52,7 +49,7 @@ def checked_sender_name(name: str | None) -> str | None:
 
 
 def take_repeatedly(connection: Connection, take: Callable[[], _T], deadline: float | None) -> Iterator[_T]:
-    """Yield the results of `take`, and wait for the server while there are none.
+    """Call `take` repeatedly, and yield its results. Wait for the server while there are none.
 
     An empty result is yielded if `deadline` has passed or the connection has ended. Nothing more is received after
     `deadline`, so that a loop over the results ends even if the server keeps sending events.
@@ -133,7 +130,7 @@ class Connection(ClientCore):
             self.changed.notify_all()
 
     def request(self, request: Request, on_reply: OnReply | None = None) -> tuple[JsonObject, list[JsonObject]]:
-        """Send a request, and return the reply with its list items.
+        """Send a request. Return the reply and the items of its list.
 
         Args:
             request: the request.
@@ -159,10 +156,10 @@ class Connection(ClientCore):
         return self.answer(exchange)
 
     def begin(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> Exchange:
-        """Send a request, and return its exchange without waiting for the answer.
+        """Send a request without waiting for the answer. Return the exchange.
 
-        The arguments are those of `Exchange`.
-        A caller without `on_failure` must call `forget` if it stops waiting for the answer.
+        The arguments are those of `Exchange`. A caller without `on_failure` must call `forget` if it stops waiting for
+        the answer.
         """
         exchange = self.exchange_type(request, on_reply, on_failure)
         with self.changed:
@@ -176,7 +173,7 @@ class Connection(ClientCore):
         return exchange
 
     def submit(self, request: Request, on_reply: OnReply, on_failure: OnFailure) -> None:
-        """Send a request without blocking, and call one of the functions with its outcome.
+        """Send a request without blocking. Pass the reply to `on_reply`, or the error to `on_failure`.
 
         Later calls send the bytes that the server doesn't accept now. One of the two functions is called during this
         call or a later one, while the lock `changed` is held.
@@ -262,7 +259,7 @@ class Connection(ClientCore):
             self.wait_until(lambda: False, time.monotonic(), interruptible=False)
 
     def _cut_off(self) -> None:
-        """Break the connection after a line was sent only in part.
+        """Break the connection, because a line was sent only in part.
 
         The caller must hold the lock `changed`.
         """
@@ -425,7 +422,7 @@ class SocketConnection(Connection):
 
 
 class ReconnectingConnection(SocketConnection):
-    """A connection over a Unix socket that reconnects after it has been interrupted.
+    """A connection over a Unix socket that reconnects after a break.
 
     It has no thread of its own, so it reconnects during later calls. Only `close` ends it for good.
     """
@@ -439,7 +436,7 @@ class ReconnectingConnection(SocketConnection):
         self._due = 0.0
 
     def begin(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> Exchange:
-        """Send a request, after reconnecting if necessary."""
+        """Reconnect if necessary, and send a request. Return the exchange."""
         if on_failure is None:
             self._read_available()  # this detects a broken connection
         with self.changed:

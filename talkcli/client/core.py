@@ -46,13 +46,13 @@ if TYPE_CHECKING:
     from talkcli.protocol.events import Event
     from talkcli.protocol.requests import Request
 
-#: A callback for the reply to a request, and for the list items that preceded the reply.
+#: A callback that receives the reply to a request, and the list items before the reply.
 OnReply = Callable[["JsonObject", "list[JsonObject]"], None]
-#: A callback for the error if a request was refused, not sent, or not answered.
+#: A callback that receives the error if a request was refused, not sent, or not answered.
 OnFailure = Callable[["TalkError"], None]
 
-#: If the server sends nothing for this time, the connection is treated as broken. A working server sends waiting
-#: clients a message at least every 5 s.
+#: How long the server may be silent before the connection is treated as broken. A working server sends waiting clients
+#: a message at least every 5 s.
 SILENCE_LIMIT_S = 15.0
 #: Maximum size of the requests that are waiting to be sent.
 MAX_UNSENT_BYTES = 256 * 1024
@@ -104,7 +104,7 @@ class EventBuffer:
         return len(self._states) + len(self._feedback)
 
     def take(self) -> Event | None:
-        """Remove and return the oldest event, or return None if the buffer is empty."""
+        """Remove and return the oldest event. Return None if the buffer is empty."""
         queues = [each for each in (self._states, self._feedback) if each]
         return min(queues, key=lambda each: each[0][0]).popleft()[1] if queues else None
 
@@ -119,7 +119,7 @@ class EventListeners:
         self.watches: WeakSet[EventBuffer] = WeakSet()
 
     def add(self, tracked: TrackedGoal) -> None:
-        """Pass a goal's events and all pauses to `tracked`.
+        """Start to pass a goal's events and all pauses to `tracked`.
 
         This ends when the goal has ended or is lost.
         """
@@ -127,7 +127,7 @@ class EventListeners:
 
     @property
     def goals(self) -> dict[str, bool]:
-        """The ids of the followed goals, and whether each needs words."""
+        """The ids of the followed goals, and whether their words are needed."""
         return {goal_id: any(each._with_feedback for each in some) for goal_id, some in self._goals.items()}
 
     @property
@@ -144,7 +144,7 @@ class EventListeners:
             tracked._mark_lost(why)
 
     def update(self, goal: Goal) -> None:
-        """Pass a goal's current state on to all objects that follow the goal."""
+        """Pass a goal's current state to all objects that follow the goal."""
         for tracked in self._goals.get(goal.id, set()):
             tracked._hear(goal)
 
@@ -194,7 +194,7 @@ class TrackedGoal:
         self.speech_paused = False
         #: whether this client still adds text to the goal
         self._adds_text = False
-        #: monotonic time since which the server has sent the goal's events, or None
+        #: monotonic time at which the server began to send the goal's events, or None
         self._followed_at: float | None = None
         #: whether to buffer words and pauses, too
         self._with_feedback = False
@@ -280,16 +280,13 @@ class TrackedGoal:
         return self.goal.state.terminal or bool(self._buffer)
 
     def _take(self) -> Event | None:
-        """Remove and return the next event, ending with the Result.
-
-        Return None if nothing is new.
-        """
+        """Remove and return the next event, if any. The last event is the Result."""
         return self._buffer.take() or (Result(self.goal) if self.goal.state.terminal else None)
 
 
 @frozen
 class ServerInfo:
-    """The description of a server in its greeting or in its robot's presence."""
+    """A server's description of itself, from its greeting or its robot's presence."""
 
     boot: str = ""
     pid: int | None = None
@@ -299,14 +296,14 @@ class ServerInfo:
 
     @classmethod
     def read(cls, server: JsonObject) -> ServerInfo:
-        """Read a server's description from a JSON object, without its invalid fields."""
+        """Read a server's description from a JSON object. Ignore invalid fields."""
         features = server.get("features")
         names = tuple(map(str, features)) if isinstance(features, list) else None
         return cls(**{**read_fields(cls, {**server, "features": None}), "features": names})
 
 
 def read_greeting(line: bytes, path: str) -> ServerInfo:
-    """Read a server's first line, or raise an error if the server can't be used.
+    """Read a server's greeting. Raise an error if the server can't be used.
 
     Raises:
         ServerUnavailable: the line is not a greeting.
@@ -403,7 +400,7 @@ class ClientCore:
         self._heard = now
         #: unsent lines, each with its exchange
         self._unsent: deque[tuple[bytes, Exchange]] = deque()
-        #: how many bytes of the first unsent line have been sent
+        #: how many bytes of the first line in `_unsent` have already been sent
         self._first_sent_bytes = 0
         #: the unsent part of the hello line, which is sent before the server's greeting arrives
         self._hello = b""
@@ -427,7 +424,7 @@ class ClientCore:
     # -- requests
 
     def register(self, exchange: Exchange, now: float) -> None:
-        """Give an exchange its number, and start waiting for the answer."""
+        """Give an exchange a number, and start waiting for its answer."""
         exchange.number = exchange.number or next(self._numbers)
         exchange.heard_at = now
         self.exchanges[exchange.number] = exchange
@@ -494,7 +491,7 @@ class ClientCore:
         return True
 
     def stop_sending(self, why: str) -> None:
-        """Fail all unsent and later requests.
+        """Fail all unsent requests, and all later ones.
 
         Answers to earlier requests can still be received.
         """
@@ -505,7 +502,7 @@ class ClientCore:
             self.fail(exchange, self.unanswered(exchange))
 
     def answer(self, exchange: Exchange) -> tuple[JsonObject, list[JsonObject]]:
-        """Return the reply to a request and its list items, or raise its error.
+        """Return the reply to a request and the items of its list. Raise the error if it failed.
 
         Raises:
             RequestRefused: the server refused the request.
@@ -608,7 +605,7 @@ class ClientCore:
     # -- receiving
 
     def split(self, data: bytes, now: float) -> list[bytes]:
-        """Add received bytes, and return the lines that are now complete.
+        """Add received bytes. Return the lines that are now complete.
 
         Transports that pass lines on without decoding them use this method instead of `receive`.
         """
@@ -643,7 +640,7 @@ class ClientCore:
         return self.exchanges.get(number) if isinstance(number, int) else None
 
     def dispatch(self, message: JsonObject, now: float) -> Exchange | None:
-        """Process a received message, and return the exchange that it has ended, if any.
+        """Process a received message. Return the exchange that it ends, if any.
 
         The message is an event, a list item or a reply.
 
@@ -666,7 +663,7 @@ class ClientCore:
         return exchange
 
     def _finish(self, exchange: Exchange, reply: JsonObject) -> None:
-        """End an exchange with its reply, and call its function for success or failure.
+        """End an exchange with the server's reply, and call its `on_reply` or `on_failure`.
 
         Raises:
             Unreadable: a goal in the reply is malformed.
@@ -723,7 +720,7 @@ class ClientCore:
         self.begin_stream()
 
     def not_connected(self, error: TalkError) -> None:
-        """Record a failed attempt to reconnect, and fail requests that callers wait for.
+        """Record a failed attempt to reconnect. Fail the requests that callers are waiting for.
 
         These are the exchanges without an `on_failure`.
         """
@@ -733,9 +730,9 @@ class ClientCore:
             self.fail(exchange, error)
 
     def connected(self, server: ServerInfo, now: float) -> None:
-        """Record the greeting after reconnecting, and follow all goals again or end them.
+        """Record the greeting after reconnecting. Follow all goals again, or end them as LOST.
 
-        The goals are followed again if the server wasn't restarted in the meantime. Otherwise they are LOST. Their
+        The goals are LOST if the server was restarted in the meantime. Otherwise, they are followed again, and their
         texts continue over this connection. Watches and waiting requests are sent again.
 
         Args:
@@ -761,7 +758,7 @@ class ClientCore:
                 self.queue(self._renew_line(exchange, now), exchange)
 
     def _renew_line(self, exchange: Exchange, now: float) -> bytes:
-        """Return a waiting request's line, with its TTL reduced by the time waited."""
+        """Reduce the TTL of a waiting request by the time that it has waited. Return its line."""
         request = exchange.request
         if isinstance(request, Say) and request.ttl:
             exchange.request = replace(request, ttl=max(MIN_TTL_S, request.ttl - (now - exchange.heard_at)))
@@ -777,7 +774,7 @@ class ClientCore:
                     self.listeners.update(goal)
 
         def on_failure(error: TalkError) -> None:
-            if self.absent_since is None:  # if the connection breaks again, the next one follows the goal
+            if self.absent_since is None:  # after another break, the next connection follows the goal
                 self.listeners.lose(goal_id, f"{error.message}; the sentence may have been spoken")
 
         self._begin(Exchange(Wait((goal_id,), feedback), on_reply, on_failure), now)

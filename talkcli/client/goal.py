@@ -55,9 +55,9 @@ class GoalHandle(TrackedGoal):
         return self.goal.state
 
     def wait(self, timeout: float | None = None) -> Goal:
-        """Wait until the goal has ended, and return it.
+        """Wait until the goal has ended, and return it. Raise TimeoutError if `timeout` expires first.
 
-        Raise TimeoutError if `timeout` expires first. If the goal can no longer be followed, for example because the
+        If the goal can no longer be followed, for example because the
         server was restarted, the goal ends as LOST. It may or may not have been spoken.
 
         Args:
@@ -105,7 +105,7 @@ class GoalHandle(TrackedGoal):
         return (each for each in self._iterate_events(end, timeout) if isinstance(each, WordHeard))
 
     def poll(self) -> Event | None:
-        """Read from the server without blocking, and return the goal's next event, if any.
+        """Read from the server without blocking. Return the goal's next event, if any.
 
         The Result is the last event. Call this method regularly, because each call also receives the events of other
         goals, and sends the rest of earlier requests.
@@ -143,7 +143,7 @@ class GoalHandle(TrackedGoal):
                 raise failures[0]
 
     def cancel(self) -> Goal:
-        """Cancel the goal, and return it once it is silent.
+        """Cancel the goal. Return it once it is silent.
 
         Raises:
             UnknownGoal: the server doesn't know the goal, for example because the server was restarted.
@@ -168,10 +168,7 @@ class GoalHandle(TrackedGoal):
         self._listen_to(self._connection.listeners, feedback=feedback, now=time.monotonic())
 
     def _iterate_events(self, end: float | None, timeout: float | None) -> Iterator[Event]:
-        """Yield the goal's events up to its Result.
-
-        Raises TimeoutError if `end` (monotonic) passes first.
-        """
+        """Yield the goal's events up to its Result. Raise TimeoutError at the monotonic time `end`."""
         for event in take_repeatedly(self._connection, self._take, end):
             if event is None:
                 self._give_up(timeout)
@@ -208,7 +205,7 @@ class GoalHandle(TrackedGoal):
 
 
 def merged(handles: Sequence[GoalHandle], timeout: float | None = None) -> Iterator[tuple[GoalHandle, Event]]:
-    """Yield the events of several goals, with their handles, until all goals have ended.
+    """Yield the events of several goals until all of them have ended. Each comes with its goal's handle.
 
     The last event of each goal is its Result. A pause of all speech is yielded only once. If the connection ends, the
     remaining goals end as LOST.
@@ -247,7 +244,7 @@ class _EventStream:
         self._last_pause = 0
 
     def take(self) -> list[tuple[GoalHandle, Event]]:
-        """Remove and return the new events of all goals in order.
+        """Remove and return the new events of all goals, in the server's order.
 
         The caller must hold the connection's lock.
         """

@@ -19,7 +19,7 @@ class TextSender:
         `say` has the options of the goal.
         """
         self._say = say
-        #: the text that the server doesn't have yet, as far as it is known
+        #: the text that the server doesn't have yet, as far as the client knows
         self._unsent = ""
         #: the number of characters that the server has
         self._length = 0
@@ -36,17 +36,17 @@ class TextSender:
         """Add text at the end."""
         self._unsent = _join_surrogates(self._unsent + text)
 
-    def next_request(self) -> Say | Append | None:
-        """Return the next request, or None if there is nothing to send.
+    def request_to_send(self) -> Say | Append | None:
+        """Return the request to send, or None if there is nothing to send.
 
-        A request is returned until it has been answered. After a broken connection, it can be sent again, because the
+        The same request is returned until it is answered. After a broken connection, it can be sent again, because the
         server ignores text that it already has.
         """
         self._open = self._open or self._create_request()
         return self._open
 
     def accepted(self, goal_id: str) -> Say | Append:
-        """Record that the server has accepted the unanswered request, and return it."""
+        """Record that the server has accepted the unanswered request. Return that request."""
         request = self._open
         assert request
         self.refused()
@@ -56,12 +56,12 @@ class TextSender:
         return request
 
     def refused(self) -> None:
-        """Forget the unanswered request and its text, which is not sent again."""
+        """Drop the unanswered request and its text. The text is not sent again."""
         if self._open:
             self._unsent, self._open = self._unsent[len(self._open.text) :], None
 
     def _create_request(self) -> Say | Append | None:
-        """Return a request for the text that can be sent now, if any."""
+        """Return a new request for the text that can be sent now, if any."""
         text = self._unsent[:MAX_TEXT_CHARS]
         is_last = self.ended and len(text) == len(self._unsent)
         if not is_last and "\ud800" <= text[-1:] <= "\udbff":  # the other half of a surrogate pair follows
@@ -75,7 +75,7 @@ class TextSender:
 
 
 def _join_surrogates(text: str) -> str:
-    """Replace surrogate pairs by the characters that they stand for.
+    """Replace the surrogate pairs in a text by the characters that they stand for.
 
     Programs that decode JSON in pieces may pass the halves of a pair separately. The server joins the halves that come
     in one request, so it would count fewer characters than this client.

@@ -35,7 +35,7 @@ class SpeechStream:
     """
 
     def __init__(self, connection: Connection, say: Say) -> None:
-        """Initialise a stream without sending anything.
+        """Create a stream without sending anything.
 
         `say` has the options of the goal.
         """
@@ -47,7 +47,7 @@ class SpeechStream:
         self._refused = False
 
     def write(self, text: str) -> bool:
-        """Add text at the end, and return whether the goal can still take text.
+        """Add text at the end. Return whether the goal can still take text.
 
         Text is sent at once, except blanks at the very beginning. If more than 10,000 characters have not been heard,
         the call waits until more of them have been heard.
@@ -66,9 +66,7 @@ class SpeechStream:
         return self._send()
 
     def wait(self, timeout: float | None = None) -> Goal | None:
-        """Wait until the goal has ended, and return it.
-
-        Return None if there is no goal.
+        """Wait until the goal has ended, and return it. Return None if there is no goal.
 
         Call this method after the block. The arguments and errors are those of `GoalHandle.wait`.
         """
@@ -92,9 +90,9 @@ class SpeechStream:
         return self._refused or (self.goal is not None and self.goal.state.terminal)
 
     def _send(self) -> bool:
-        """Send all text that can be sent, and return whether the goal can still take text."""
+        """Send all text that can be sent. Return whether the goal can still take text."""
         connection, resends = self._connection, 0
-        while not self._stopped and (request := self._text.next_request()):
+        while not self._stopped and (request := self._text.request_to_send()):
             if isinstance(request, Say):
                 self._begin_goal(request)
                 continue
@@ -112,7 +110,7 @@ class SpeechStream:
         return not self._stopped
 
     def _begin_goal(self, request: Say) -> GoalHandle:
-        """Send the goal with the beginning of its text, and return its handle.
+        """Send the goal with the beginning of its text. Return its handle.
 
         Wait for the server's answer.
         """
@@ -128,7 +126,7 @@ class SpeechStream:
         return handle
 
     def _add_text(self, *_: object) -> None:
-        """Add text to the goal that the server has accepted."""
+        """Add the text that the server has accepted to the handle's goal."""
         assert self.goal
         addition = self._text.accepted(self.goal.id)
         assert isinstance(addition, Append)

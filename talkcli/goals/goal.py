@@ -1,4 +1,4 @@
-"""Immutable copies of goals and their senders, and conversion to and from JSON.
+"""Goals and their senders as immutable values, with conversion to and from JSON.
 
 This module only defines the format. The scheduler decides whether a goal is accepted. Fields may be added, but a field
 never changes its name or meaning. Unknown fields are ignored here, but a request with an unknown field is refused.
@@ -19,7 +19,7 @@ JsonObject = dict[str, object]
 
 #: Largest accepted time, about 30 million years.
 _MAX_TIME_S = 1e15
-#: Beginnings of messages that only repeat the goal's state. Those with "Talk" come from older servers.
+#: Prefixes of messages that only repeat the goal's state. Prefixes with "Talk" come from older servers.
 _STATE_PREFIXES = (
     *("not spoken", "speech failed", "result unknown"),
     *("Talk rejected", "Talk recalled", "Talk aborted", "Talk lost"),
@@ -59,14 +59,14 @@ class By:
     client: Sender | None = None
 
     def to_json(self) -> JsonObject | None:
-        """Return a JSON object with the goal or the client, or None for the server itself."""
+        """Return the goal or the client as a JSON object, or None for the server itself."""
         if self.goal is not None:
             return {"goal": self.goal}
         return None if self.client is None else {"client": self.client.to_json()}
 
     @classmethod
     def from_json(cls, value: object) -> By | None:
-        """Read a goal or client from its JSON object. Return None if it isn't an object."""
+        """Read the goal or client from a JSON object. Return None for any other value."""
         return cls(**read_fields(cls, value)) if isinstance(value, dict) else None
 
 
@@ -88,7 +88,7 @@ class Output:
 
     @classmethod
     def from_json(cls, value: object) -> Output | None:
-        """Read an output from its JSON object. Return None if a field is missing or malformed."""
+        """Read an output from a JSON object. Return None if a field is missing or malformed."""
         found = read_fields(cls, value)
         return cls(**found) if len(found) == len(cls.__annotations__) else None
 
@@ -112,9 +112,9 @@ class Goal:
     format: str = "text"
     #: text up to the end of the last word that has started
     spoken: str | None = None
-    #: offset in the text of the end of the last word that was heard to its end
+    #: end of the last word that was heard completely, as an offset in the text
     spoken_end: int | None = None
-    #: seconds of the audio that were heard
+    #: how many seconds of the audio were heard
     heard: float | None = None
     priority: int = 0
     key: str | None = None
@@ -124,7 +124,7 @@ class Goal:
     paused: bool = False
     #: whether the text may still grow
     more: bool = False
-    #: whether nothing is heard because the next part of the text is missing
+    #: whether the goal is silent because the next part of its text is missing
     waits: bool = False
     queued_at: float | None = None
     started_at: float | None = None
@@ -173,7 +173,7 @@ class Goal:
 
     @classmethod
     def from_json(cls, value: object) -> Goal:
-        """Read a goal from its JSON object, or raise Unreadable.
+        """Read a goal from a JSON object. Raise Unreadable if it is malformed.
 
         The id and the state are required. Other fields that are missing or malformed get their defaults.
         """
@@ -183,11 +183,11 @@ class Goal:
         return cls(**found)
 
 
-def read_fields(cls: type, message: object) -> dict[str, Any]:
-    """Return the values in a JSON object that are valid for the fields of a class."""
+def read_fields(data_class: type, message: object) -> dict[str, Any]:
+    """Read the fields of a class from a JSON object. Return only the valid values."""
     found = {}
     values = message if isinstance(message, dict) else {}
-    for name, annotation in cls.__annotations__.items():
+    for name, annotation in data_class.__annotations__.items():
         value = values.get(name)
         if value is not None and (read := _READERS[annotation.partition(" ")[0]](value)) is not None:
             found[name] = read
@@ -201,12 +201,12 @@ def message_details(message: str | None) -> str:
 
 
 def _create_reader(kind: type) -> Callable[[object], object]:
-    """Create a function that returns a value of this type unchanged, and None for any other."""
+    """Return a function that returns its argument if it has this type, and None otherwise."""
     return lambda value: value if type(value) is kind else None
 
 
 def read_seconds(value: object) -> float | None:
-    """Return a time in seconds from a message, or None if it is not valid."""
+    """Convert a value from a message to a time in seconds. Return None if it is not valid."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
     return float(value) if number and abs(value) <= _MAX_TIME_S else None  # type: ignore[arg-type]
 

@@ -53,7 +53,7 @@ class History:
         self._text_bytes = 0
 
     def add(self, record: Record) -> None:
-        """Add an ended goal, and drop old goals or texts if there are too many."""
+        """Add an ended goal. If there are too many goals or texts, drop the oldest."""
         limits = {State.REJECTED: MAX_REJECTED_GOALS, State.RECALLED: MAX_RECALLED_GOALS}
         ids = self._ids[record.state if record.state in limits else State.SUCCEEDED]
         ids.append(record.id)
@@ -67,7 +67,7 @@ class History:
             oldest.drop_text()
 
     def find(self, goal_id: str) -> Record | None:
-        """Return the ended goal with this id, or None if it isn't known."""
+        """Return the ended goal with this id, or None if it is unknown."""
         return self._all.get(goal_id)
 
     def latest(self, count: int, *, include_rejected: bool) -> list[Record]:
@@ -98,9 +98,9 @@ class SpeechTimes:
                 _set_newest(self._starts, each, (record.began_at, record.id), MAX_SPEECH_TIMES)
 
     def last_goal_id(self, since: float, key: str | None, text: str) -> str | None:
-        """Return the id of the last goal that started after `since` with this key or text.
+        """Return the id of the last goal with this key or text that started after `since`, if any.
 
-        The text counts only if `key` is None. Return None if there is no such goal. Times are monotonic.
+        The text counts only if `key` is None. Times are monotonic.
         """
         last = self._starts.get(_digest(text) if key is None else key)
         return last[1] if last is not None and last[0] > since else None
@@ -118,13 +118,13 @@ class EarlyCancels:
         _set_newest(self._cancels, goal_id, (now + EARLY_CANCEL_S, by), MAX_EARLY_CANCELS)
 
     def find(self, goal_id: str | None, now: float) -> By | None:
-        """Return the client that recently cancelled a goal id, if any."""
+        """Return the client that recently cancelled the goal with this id, if any."""
         lapses_at, by = self._cancels.get(goal_id, (now, None))
         return by if now < lapses_at else None
 
 
 def _set_newest(entries: OrderedDict[_Key, _Value], key: _Key, value: _Value, limit: int) -> None:
-    """Set an entry as the newest one, and drop the oldest if there are too many."""
+    """Store an entry as the newest one. If there are too many entries, drop the oldest."""
     entries[key] = value
     entries.move_to_end(key)
     if len(entries) > limit:

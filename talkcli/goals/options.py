@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from talkcli.goals.reasons import Refusal
 
 MAX_ID_CHARS = 64
-#: Maximum number of ids in a request. More would not fit into a line.
+#: Maximum number of ids in a request. More ids would not fit into a line.
 MAX_IDS = 4096
 #: Maximum length of a client's name, which is shown on one line of a terminal.
 MAX_SENDER_NAME_CHARS = 64
@@ -35,10 +35,10 @@ MAX_LOG_GOALS = 2_200
 MAX_TEXT_CHARS = 10_000
 #: Maximum size of a text. 10,000 characters of four bytes each still fit into a request.
 MAX_TEXT_BYTES = 40_000
-#: How many times longer than other texts a growing text may be. It can be interrupted, and its sender sees how far it
-#: was spoken.
+#: A growing text may be this many times longer than other texts. It can be interrupted, and its sender sees how much of
+#: it was spoken.
 GROWTH_FACTOR = 5
-#: How long a growing text that was spoken completely waits for more text, by default and at least and at most.
+#: How long a growing text waits for more text after it was spoken: the default, the minimum and the maximum.
 STALL_S, MIN_STALL_S, MAX_STALL_S = 5, 1, 60
 #: Highest priority. Every JSON parser can represent this number exactly.
 MAX_PRIORITY = 1_000_000
@@ -198,7 +198,7 @@ class Option:
     form: str = ""
     #: description of the default in the protocol's document, unless it is the server's default
     default_words: str = ""
-    #: command-line flags if `--name` is not enough: "-w, --wait", or "--preempt/--queue" for yes and no
+    #: command-line flags other than `--name`: "-w, --wait", or "--preempt/--queue" for yes and no
     special_flags: str = ""
     metavar: str = ""
     help: str = ""
@@ -290,7 +290,7 @@ def check_key(value: str) -> str | None:
 
 
 def _check_own_id(value: str) -> str | None:
-    """Return an error message if clients must not choose this id."""
+    """Return an error message if a client may not choose this id."""
     if is_clients_id(value):
         return None
     return (
@@ -666,9 +666,10 @@ class Cancel:
         return self.ids is None and not self.current and self.before is None and self.key is None
 
     def select_waiting(self, goals: Sequence[Say]) -> list[int]:
-        """Return the indexes of those goals waiting for room in the queue that the request cancels.
+        """Return the indexes of the waiting goals that the request cancels.
 
-        The goals have an id only if their sender chose one, so `before` selects them only if it names such an id.
+        These goals wait for room in the queue. They have an id only if their sender chose one, so `before` selects them
+        only if it names such an id.
         """
         ids = set(self.ids or ())
         last = max((index for index, say in enumerate(goals) if say.id == self.before is not None), default=-1)
@@ -679,14 +680,14 @@ class Cancel:
         ]
 
 
-def require_fields(cls: type, options: Iterable[str]) -> None:
+def require_fields(data_class: type, options: Iterable[str]) -> None:
     """Raise TypeError if a class has no field for one of the options.
 
     Called when a module is imported.
     """
     for name in options:
-        if name not in cls.__annotations__:
-            raise TypeError(f"{cls.__name__} has no field for the option {name!r}")
+        if name not in data_class.__annotations__:
+            raise TypeError(f"{data_class.__name__} has no field for the option {name!r}")
 
 
 for _request in (Say, Append, Set, Cancel):
@@ -710,7 +711,7 @@ def bad_option(request: Say | Set) -> str | None:
 
 
 def bad_text(text: str, max_chars: int | None = MAX_TEXT_CHARS) -> Refusal | None:
-    """Return the reason and a message if a text obviously can't be spoken, or None.
+    """Return the reason and a message if a text obviously can't be spoken. Otherwise, return None.
 
     Args:
         text: the text.
@@ -726,21 +727,19 @@ def bad_text(text: str, max_chars: int | None = MAX_TEXT_CHARS) -> Refusal | Non
 
 
 def is_visible(text: str) -> bool:
-    """Return whether a text contains a visible character, so that it may be spoken."""
+    """Return whether a text contains a visible character."""
     import unicodedata
 
     return any(unicodedata.category(each) not in _SILENT_CATEGORIES for each in text)
 
 
 def bad_characters(text: str, max_chars: int | None, before_chars: int = 0) -> Refusal | None:
-    """Return the reason and a message if a text is too long or has a forbidden character.
-
-    Otherwise, return None.
+    """Return the reason and a message if a text is too long or has a forbidden character, or else None.
 
     Args:
         text: the text.
         max_chars: the maximum number of characters, or None for no limit.
-        before_chars: the number of characters of a growing text before this one, which count, too.
+        before_chars: the length of the earlier parts of a growing text, which counts, too.
     """
     from talkcli.goals.reasons import Reason
 
@@ -775,7 +774,7 @@ def shown_settings(settings: Set) -> JsonObject:
 
 
 def _replace_none_values(values: dict[str, Any]) -> dict[str, Any]:
-    """Return a copy of settings in which None replaces values that mean "none"."""
+    """Return a copy of the settings, with None for each value that means "none"."""
     return {name: None if value == _NONE_VALUES.get(name) else value for name, value in values.items()}
 
 

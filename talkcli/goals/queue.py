@@ -80,9 +80,9 @@ class Queue:
         return self._displaceable[-1][2] if self._displaceable else None
 
     def add(self, record: Record, replaced: Record | None = None) -> None:
-        """Add a goal at its place in the speaking order, or in the place of a removed goal.
+        """Add a goal to the queue. If it replaces a goal, it takes that goal's place.
 
-        Its place is behind the other goals of its priority, or in front of them if the goal preempts.
+        Otherwise, its place is behind the other goals of its priority, or in front of them if the goal preempts.
 
         Args:
             record: the new goal.
@@ -103,7 +103,7 @@ class Queue:
             del self._by_key[record.say.key]
 
     def next_expiry(self) -> float:
-        """Return the monotonic time at which the next goal expires, or inf if none can."""
+        """Return the monotonic time at which the next goal expires, or inf if no goal expires."""
         return self._expiries[0][0] if self._expiries else inf
 
     def expired(self, now: float) -> list[Record]:
@@ -111,7 +111,7 @@ class Queue:
         return list(map(_record_of, self._expiries[: bisect_left(self._expiries, (now, inf))]))
 
     def _entries(self, record: Record) -> Iterator[tuple[list[_Entry], _Entry]]:
-        """Yield each sorted list that contains a goal, with the goal's entry."""
+        """Yield each sorted list that contains the goal, and the goal's entry in that list."""
         entry = -record.say.priority, record.position, record
         yield self._goals, entry
         yield self._displaceable, (-record.say.priority, record.number, record)

@@ -39,9 +39,9 @@ class Record:
     preempt: bool = False
     #: monotonic time at which the goal expires if it hasn't started, or inf
     expires_at: float = inf
-    #: number of characters with which the goal was sent; a growing text gets more
+    #: length of the text when the goal was sent; a growing text gets longer
     first_chars: int = 0
-    #: hash of these characters if the text was dropped to free memory, otherwise None
+    #: hash of the text that was first sent, if the text was dropped to save memory, otherwise None
     text_hash: int | None = None
     state: State = State.PENDING
     #: position in the queue among the goals of the same priority
@@ -51,19 +51,19 @@ class Record:
     message: str | None = None
     #: offset of the end of the last word that has started, or 0 if nothing was heard
     begun_end: int = 0
-    #: offset of the end of the last word that was heard to its end
+    #: offset of the end of the last word that was heard completely
     spoken_end: int = 0
-    #: seconds of the audio that were heard, as far as known
+    #: how many seconds of the audio were heard, as far as is known
     heard: float = 0.0
     #: whether the text may still grow
     more: bool = False
     #: whether the text broke off, so that the goal can't succeed
     broken: bool = False
-    #: whether nothing is heard because the next part of the text is missing
+    #: whether the goal is silent because the next part of its text is missing
     waits: bool = False
     #: monotonic time by which more text must arrive, or inf
     stalls_at: float = inf
-    #: monotonic time by which another connection must continue the text of a sender that left, or inf
+    #: if the sender left, monotonic time by which another connection must continue the text, otherwise inf
     orphaned_until: float = inf
     #: whether the goal is paused
     paused: bool = False
@@ -88,7 +88,7 @@ class Record:
         return len(self.say.text.encode(errors="surrogatepass"))
 
     def change_state(self, state: State) -> None:
-        """Change the state of the goal, or raise IllegalTransition."""
+        """Change the state of the goal. Raise IllegalTransition if the change isn't allowed."""
         if state not in TRANSITIONS[self.state]:
             raise IllegalTransition(f"a goal can't change from {self.state.name} to {state.name}")
         self.state = state

@@ -58,7 +58,7 @@ class StateChange:
 
 
 class Order(Enum):
-    """An order to the engine concerning a goal. Its value is the name used in the log."""
+    """An order to the engine about a goal. The value is the order's name in the log."""
 
     START = "Start"
     #: become silent, then report that the goal has ended
@@ -130,7 +130,7 @@ class Scheduler:
         self.active: Record | None = None
         #: whether speech is paused
         self.paused = False
-        #: whether goals can start, even if they fail at once without an engine
+        #: whether goals can start. If no engine can be started, they start and fail at once.
         self.has_engine = False
         #: goals whose sender left before their text ended
         self._orphans: list[Record] = []
@@ -157,7 +157,7 @@ class Scheduler:
         return self._by_id.get(goal_id) or self.history.find(goal_id)
 
     def has_room(self, say: Say) -> bool:
-        """Return whether the queue has or can make room for a goal.
+        """Return whether the queue has room for a goal, or can make room.
 
         A known id needs no room.
         """
@@ -190,7 +190,7 @@ class Scheduler:
         canceler: By | None = None,
         waited_s: float = 0.0,
     ) -> tuple[Record, list[Effect]]:
-        """Reject a goal or add it to the queue, and return its record and the effects.
+        """Add a goal to the queue, or reject it. Return its record and the effects.
 
         A rejected goal doesn't affect other goals.
 
@@ -244,9 +244,10 @@ class Scheduler:
     def cancel(
         self, selection: Cancel, sender: Sender | None, now: Now, waiting_ids: Collection[str | None] = ()
     ) -> Cancellation:
-        """Cancel the selected goals, remember cancels for unknown ids, and return the result.
+        """Cancel the selected goals, and remember unknown ids. Return the result.
 
-        Pending goals end at once. The active goal ends when the engine is silent.
+        Pending goals end at once. The active goal ends when the engine is silent. If a goal with a remembered id
+        arrives soon, it is cancelled, too.
 
         Args:
             selection: the goals to cancel.
@@ -272,7 +273,7 @@ class Scheduler:
         return result
 
     def append(self, record: Record, addition: Append, now: Now) -> list[Effect]:
-        """Add text to a goal or mark its text as complete, and return the effects.
+        """Add text to a goal, or mark its text as complete. Return the effects.
 
         An addition that was sent before changes nothing.
 
@@ -312,9 +313,9 @@ class Scheduler:
         return [EngineOrder(record, Order.APPEND)] if record.state is State.ACTIVE and (added or addition.end) else []
 
     def producer_left(self, record: Record, now: Now) -> list[Effect]:
-        """Handle the loss of a text's sender: end the goal, or wait for a new connection.
+        """End a goal whose sender left, or wait for another connection. Return the effects.
 
-        Wait only if the sender chose the goal's id. Return the effects.
+        Another connection can continue the text only if the sender chose the goal's id.
         """
         if not record.more or record.say.id is None:
             return self.break_off(record, now)
@@ -324,9 +325,9 @@ class Scheduler:
         return []
 
     def break_off(self, record: Record, now: Now, *, at_once: bool = False) -> list[Effect]:
-        """End a goal whose text stays incomplete, at once or after its complete sentences.
+        """End a goal whose text is incomplete, at once or after its complete sentences. Return the effects.
 
-        A goal that hasn't started always ends at once. Return the effects.
+        A goal that hasn't started always ends at once.
         """
         self._stop_awaiting_sender(record)
         if not (record.more and record.state in {State.PENDING, State.ACTIVE}):
@@ -337,7 +338,7 @@ class Scheduler:
         return self._stop(record, Reason.BROKEN_OFF, None, now) if at_once else [EngineOrder(record, Order.APPEND)]
 
     def change_settings(self, changes: dict[str, object], now: Now) -> list[Effect]:
-        """Change the settings for goals that have not started, and return the effects.
+        """Change the settings for goals that have not started. Return the effects.
 
         A new voice that failed to load earlier is loaded again.
         """
@@ -349,10 +350,7 @@ class Scheduler:
         return self.tick(now)  # the next goal may not have to wait for its voice any more
 
     def pause(self) -> list[Effect]:
-        """Pause the active goal, and let no goal start until `resume` is called.
-
-        Return the effects.
-        """
+        """Pause the active goal, and start no other goal until `resume` is called. Return the effects."""
         if self.paused:
             return []
         self.paused = True
@@ -363,7 +361,7 @@ class Scheduler:
         return [EngineOrder(self.active, Order.HOLD)]
 
     def resume(self, now: Now) -> list[Effect]:
-        """End the pause, and resume the paused goal or start the next one."""
+        """End the pause, and resume the paused goal or start the next one. Return the effects."""
         if not self.paused:
             return []
         self.paused = False
@@ -374,10 +372,7 @@ class Scheduler:
         return [EngineOrder(self.active, Order.RESUME)]
 
     def shutdown(self, now: Now) -> list[Effect]:
-        """End all pending goals, stop the active one, and reject new ones.
-
-        Return the effects.
-        """
+        """End all pending goals, stop the active one, and reject new ones. Return the effects."""
         self.closing = True
         effects: list[Effect] = []
         for record in list(self.pending):
@@ -389,7 +384,7 @@ class Scheduler:
     # -- reports from the engine
 
     def engine_lost(self, now: Now) -> list[Effect]:
-        """Record that the engine process has exited, and return warnings about voices.
+        """Record that the engine process has exited. Return warnings about voices, if any.
 
         No goal starts until a new engine is ready.
         """
@@ -397,9 +392,9 @@ class Scheduler:
         return [*self.voices.engine_lost(now.monotonic)]
 
     def engine_ready(self, now: Now) -> list[Effect]:
-        """Record that an engine is ready, and start the next goal.
+        """Record that an engine is ready, and start the next goal. Return the effects.
 
-        Return the effects, which also load the voices that goals need.
+        The effects also load the voices that goals need.
         """
         self.has_engine = self._loads_voices = True
         for voice in (*self._needed_voices(), self.settings.voice or ""):
@@ -407,15 +402,15 @@ class Scheduler:
         return self._start_next(now) + self._order_next_voice(now)
 
     def engine_unavailable(self, now: Now) -> list[Effect]:
-        """Record that no engine can be started, so that goals fail instead of waiting.
+        """Record that no engine can be started, and start the next goal. Return the effects.
 
-        Return the effects, which start the next goal.
+        From now on, goals fail instead of waiting for an engine.
         """
         self.has_engine, self._loads_voices = True, False
         return self._start_next(now)
 
     def fail_next(self, message: str, now: Now) -> list[Effect]:
-        """Fail the next goal, unless an engine is available.
+        """Fail the next goal, unless an engine is available. Return the effects.
 
         Called after a long wait for an engine.
         """
@@ -439,14 +434,14 @@ class Scheduler:
         """
         record = self._require_active(goal_id)
         if start >= record.begun_end:
-            between = record.say.text[record.begun_end : start]  # may have a word that is spoken with the one before it
+            between = record.say.text[record.begun_end : start]  # may have a word that was spoken with the last one
             opening = [] if between[-1:].isspace() else between.split()[-1:]  # a quotation mark before the new word
             record.spoken_end = record.begun_end + len(between.removesuffix("".join(opening)).rstrip())
         record.begun_end = max(record.begun_end, end)
         self.audio_heard(goal_id, seconds)
 
     def audio_heard(self, goal_id: str, seconds: float) -> None:
-        """Record how many seconds of the active goal's audio were heard so far."""
+        """Record how many seconds of the active goal's audio have been heard so far."""
         record = self._require_active(goal_id)
         record.heard = max(record.heard, seconds)
 
@@ -459,10 +454,7 @@ class Scheduler:
         self._reset_stall_limit(record, now)
 
     def voice_chosen(self, goal_id: str, voice: str, now: Now) -> list[Effect]:
-        """Record which voice speaks the active goal.
-
-        Return the order to load the next voice, if any.
-        """
+        """Record which voice speaks the active goal. Return the order to load the next voice, if any."""
         self._require_active(goal_id).voice = voice
         return self._order_next_voice(now)
 
@@ -476,9 +468,9 @@ class Scheduler:
     def completed(
         self, goal_id: str, duration: float | None, now: Now, gaps: int = 0, gap_seconds: float = 0
     ) -> list[Effect]:
-        """End the active goal after it was played to the end, usually as SUCCEEDED.
+        """End the active goal after it was played to the end, usually as SUCCEEDED. Return the effects.
 
-        It ends as ABORTED if its text broke off. Return the effects.
+        It ends as ABORTED if its text broke off.
 
         Args:
             goal_id: the id of the goal.
@@ -503,9 +495,9 @@ class Scheduler:
         return self._end(record, State.SUCCEEDED, None, words, None, now)
 
     def failed(self, goal_id: str, reason: Reason, message: str, duration: float | None, now: Now) -> list[Effect]:
-        """End the active goal as ABORTED, or as PREEMPTED if it was being stopped.
+        """End the active goal as ABORTED, or as PREEMPTED if it was being stopped. Return the effects.
 
-        Return the effects. If the goal was being stopped, the failure has silenced it, so it ends PREEMPTED. It ends
+        If the goal was being stopped, the failure has silenced it, so it ends PREEMPTED. It ends
         ABORTED only with the reason `not_silent`.
         """
         record = self._require_active(goal_id)
@@ -517,9 +509,9 @@ class Scheduler:
         return self._end(record, State.ABORTED, reason, f"speech failed: {message}", record.by, now)
 
     def stopped(self, goal_id: str, now: Now) -> list[Effect]:
-        """End the stopped goal as PREEMPTED, or as ABORTED if its text was incomplete.
+        """End the stopped goal as PREEMPTED, or as ABORTED if its text was incomplete. Return the effects.
 
-        The engine has confirmed that the goal is silent. Return the effects.
+        The engine has confirmed that the goal is silent.
         """
         record = self._require_active(goal_id)
         if record.reason in {Reason.BROKEN_OFF, Reason.TEXT_STALLED}:
@@ -529,9 +521,9 @@ class Scheduler:
         return self._end(record, State.PREEMPTED, record.reason, "Talk preempted", record.by, now)
 
     def voice_load_ended(self, voice: str, error: str | None, now: Now, *, has_libraries: bool) -> list[Effect]:
-        """Record that loading a voice succeeded or failed, and start a goal that waited for it.
+        """Record that a voice was loaded or failed to load. Return the effects.
 
-        Return the effects.
+        The effects start the next goal if it waited for the voice.
 
         Args:
             voice: the id of the voice.
@@ -544,9 +536,7 @@ class Scheduler:
         return self._order_voice_drops() + self.tick(now)
 
     def voices_measured(self, voice: str, memory_bytes: int, now: Now) -> list[Effect]:
-        """Record how much memory all neural voices use, and order voices to be dropped or loaded.
-
-        Return the orders.
+        """Record how much memory all neural voices use. Return orders to drop or load voices.
 
         Args:
             voice: the voice that was just loaded or has just spoken, or "" if a voice was dropped.
@@ -557,10 +547,7 @@ class Scheduler:
         return self._order_voice_drops() + self._order_next_voice(now)
 
     def voice_unloaded(self, voice: str, now: Now) -> list[Effect]:
-        """Record that the engine dropped a voice on its own, and order the next voice to load.
-
-        Return the order, if any.
-        """
+        """Record that the engine dropped a voice on its own. Return the order to load the next one, if any."""
         self.voices.unloaded(voice, self._needed_voices())
         return self._order_next_voice(now)
 
@@ -572,7 +559,7 @@ class Scheduler:
         return min(self._active_deadline(), self.pending.next_expiry(), self._next_deadline(), orphans)
 
     def tick(self, now: Now) -> list[Effect]:
-        """Handle all time limits that have been reached, and return the effects.
+        """Handle all time limits that have been reached. Return the effects.
 
         Expired goals are recalled. If the active goal was stopped and did not become silent in time, it is aborted. The
         next goal starts if it no longer has to wait for its voice.
@@ -596,7 +583,7 @@ class Scheduler:
     # -- selecting and accepting goals
 
     def _select(self, selection: Cancel, result: Cancellation, waiting_ids: Collection[str | None]) -> list[Record]:
-        """Return the unfinished goals that a cancel selects, and record ended and unknown ones in `result`."""
+        """Return the unfinished goals that a cancel selects. Add ended goals and unknown ids to `result`."""
         chosen = self.unfinished() if selection.selects_all else []
         for goal_id in dict.fromkeys(selection.ids or ()):
             record = self.find(goal_id)
@@ -623,7 +610,7 @@ class Scheduler:
     def _find_refusal(self, say: Say, refusal: Refusal | None, conflicting: Record | None) -> Refusal | None:
         """Return the reason why a goal must be rejected, if there is one.
 
-        The state of the queue doesn't matter.
+        This method doesn't check whether the queue has room.
 
         Args:
             say: the goal.
@@ -640,7 +627,7 @@ class Scheduler:
         return options.bad_text(say.text, limit) or refusal
 
     def _find_repeat(self, say: Say, record: Record, now: Now) -> Refusal | None:
-        """Return a refusal and set `record.by` if a goal repeats another one too soon."""
+        """If a goal repeats another one too soon, return a refusal and set `record.by`."""
         if say.throttle is None:
             return None
         active = self.active
@@ -659,11 +646,11 @@ class Scheduler:
         return Reason.THROTTLED, f"{what} {words}"
 
     def _may_preempt(self, say: Say) -> bool:
-        """Return whether a goal asks to interrupt others, itself or by the server's setting."""
+        """Return whether a goal may interrupt others, because of its options or the server's setting."""
         return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)
 
     def _find_room(self, say: Say) -> list[tuple[Record, Reason]] | None:
-        """Return the goals to remove for a new goal, with reasons, or None if there is no room."""
+        """Return the goals to remove for a new goal, with the reasons. Return None if there is no room."""
         replaced = self.pending.with_key(say.key)
         preempted: list[Record] = []
         if say.flush:
@@ -681,7 +668,7 @@ class Scheduler:
         return [(last, Reason.DISPLACED)] if last and last.say.priority <= limit else None
 
     def _enqueue(self, record: Record, to_recall: list[tuple[Record, Reason]], now: Now) -> list[Effect]:
-        """Add a goal to the queue, recall the given goals, and stop a preempted active goal.
+        """Add a goal to the queue, recall other goals, and stop the active goal if it is preempted.
 
         Return the effects.
         """
@@ -714,7 +701,7 @@ class Scheduler:
         return list(filter(options.is_neural, dict.fromkeys(voices)))
 
     def _order_next_voice(self, now: Now) -> list[Effect]:
-        """Mark the next voice as loading, and return a list with the order, if any.
+        """Mark the next voice as loading. Return a list with the order to load it, if any.
 
         The first voice is not loaded while a goal is active. Loading it imports libraries, which blocks the engine
         process for a tenth of a second.
@@ -729,7 +716,7 @@ class Scheduler:
         return [order] if order else []
 
     def _order_voice_drops(self) -> list[Effect]:
-        """Choose voices to drop if they use too much memory, and return the orders and warnings."""
+        """Drop voices if they use too much memory. Return the orders and warnings."""
         needed = self._needed_voices()
         speaking = options.without_speaker(self.active.voice) if self.active else ""
         if options.is_neural(speaking) and not self.voices.is_loaded(speaking):
@@ -739,7 +726,7 @@ class Scheduler:
     # -- starting and ending goals
 
     def _expire(self, now: Now) -> list[Effect]:
-        """Recall all pending goals that have expired."""
+        """Recall all pending goals that have expired. Return the effects."""
         effects: list[Effect] = []
         for record in self.pending.expired(now.monotonic):
             effects += self._recall(record, Reason.EXPIRED, _expiry_message(record), None, now)
@@ -772,9 +759,9 @@ class Scheduler:
         return self.voices.start_time(record, self.settings.voice) if self._loads_voices else 0.0
 
     def _start_next(self, now: Now) -> list[Effect]:
-        """Start the next goal if possible.
+        """Start the next goal if possible. Return the effects.
 
-        Return the effects, including the order to speak it.
+        They include the order to speak the goal.
         """
         if not self.has_engine:
             return []
@@ -782,7 +769,7 @@ class Scheduler:
         return [*effects, EngineOrder(record, Order.START)] if record else effects
 
     def _activate_next(self, now: Now) -> tuple[Record | None, list[Effect]]:
-        """Make the next goal ACTIVE if possible, and return it or None, with the effects.
+        """Make the next goal ACTIVE if possible. Return the goal or None, and the effects.
 
         The effects don't contain the order to speak the goal.
         """
@@ -802,17 +789,17 @@ class Scheduler:
         return record, [*effects, StateChange(record, State.ACTIVE)]
 
     def _recall(self, record: Record, reason: Reason, details: str, by: By | None, now: Now) -> list[Effect]:
-        """Remove a goal from the queue, and end it as RECALLED."""
+        """Remove a goal from the queue, and end it as RECALLED. Return the effects."""
         self.pending.remove(record)
         return self._end_unqueued(record, reason, details, by, now)
 
     def _end_unqueued(self, record: Record, reason: Reason, details: str, by: By | None, now: Now) -> list[Effect]:
-        """End a pending goal as RECALLED after it has left the queue."""
+        """End a pending goal as RECALLED after it has left the queue. Return the effects."""
         record.change_state(State.RECALLING)
         return self._end(record, State.RECALLED, reason, f"not spoken: {details}", by, now)
 
     def _stop(self, record: Record, reason: Reason, by: By | None, now: Now) -> list[Effect]:
-        """Mark the active goal as being stopped, and return the order to stop it.
+        """Mark the active goal as being stopped. Return the effects that stop it.
 
         Return no effects if it is already being stopped.
         """
@@ -830,7 +817,7 @@ class Scheduler:
         record.orphaned_until = inf
 
     def _reset_stall_limit(self, record: Record, now: Now) -> None:
-        """Restart the time limit for more text if a goal waits for text, or else remove it."""
+        """Restart the time limit for more text if a goal waits for text. Otherwise, remove the limit."""
         record.stalls_at = now.monotonic + record.say.stall if record.waits else inf
 
     def _require_active(self, goal_id: str) -> Record:
@@ -842,10 +829,7 @@ class Scheduler:
     def _end(
         self, record: Record, state: State, reason: Reason | None, message: str, by: By | None, now: Now
     ) -> list[Effect]:
-        """End a goal in this state, move it to the history, and start the next one.
-
-        Return the effects.
-        """
+        """End a goal in this state, move it to the history, and start the next one. Return the effects."""
         record.change_state(state)
         record.reason, record.message, record.by = reason, message, by
         record.ended_at, record.paused, record.more, record.waits = now.wall, False, False, False

@@ -1,4 +1,4 @@
-"""Decides which neural voices to load and drop, and how long goals wait for them.
+"""Decides which neural voices to load and unload, and how long goals wait for a voice.
 
 This module is pure: its decisions depend on the engine's reports, and the scheduler passes the orders on. The server
 knows which voices exist. A neural voice is identified by its id without a speaker. All other voices are always ready
@@ -89,7 +89,10 @@ class VoiceWarning:
 
 
 class VoiceScheduler:
-    """Decides which neural voices the engine loads and drops (unloads)."""
+    """Decides which neural voices the engine loads and drops.
+
+    To drop a voice means to unload it.
+    """
 
     def __init__(self, limit_bytes: int = 0, file_size: Callable[[str], int] = lambda _: 0) -> None:
         """Create a scheduler with no voices.
@@ -106,7 +109,7 @@ class VoiceScheduler:
         self._measured_bytes: dict[str, int] = {}
         #: memory use of all voices, as last reported by the engine
         self._reported_bytes = 0
-        #: estimated memory use of all voices, without those dropped since the last report
+        #: estimated memory use of all voices, not counting those dropped since the last report
         self._used_bytes = 0
         #: whether the engine has imported the libraries for neural voices
         self.has_libraries = False
@@ -132,9 +135,9 @@ class VoiceScheduler:
             del self._voices[voice]
 
     def start_time(self, record: Record, default_voice: str | None) -> float:
-        """Return the monotonic time until which the next goal waits for its voice.
+        """Return the monotonic time until which the next goal waits for its voice, or 0 if it doesn't wait.
 
-        Return 0 if it doesn't wait. Urgent goals don't wait. Other goals stop waiting before they expire. A
+        Urgent goals don't wait. Other goals stop waiting before they expire. A
         `voice_only` goal waits until its voice is loaded or has failed.
 
         Args:
@@ -152,7 +155,7 @@ class VoiceScheduler:
         return min(start, record.expires_at - EXPIRY_MARGIN_S)
 
     def failure(self, voice: str) -> str | None:
-        """Return the reason why a voice could not be loaded, if it failed."""
+        """Return the reason why a voice could not be loaded, or None if it didn't fail."""
         found = self._voices.get(voice)
         return found.why if found and found.state is VoiceState.FAILED else None
 
@@ -168,7 +171,7 @@ class VoiceScheduler:
         return self._loading is None and any(each.wanted for each in self._voices.values())
 
     def load_next(self, needed: Sequence[str], default_voice: str, now: float) -> VoiceLoadOrder | None:
-        """Mark the next voice as loading, and return the order to load it.
+        """Mark the next voice as loading. Return the order to load it, if any.
 
         Return None if no voice can be loaded now. Call this only if `can_load` is true. A loaded voice is not dropped
         if a goal needs it sooner than the next voice, because it would have to be loaded again.
@@ -197,9 +200,9 @@ class VoiceScheduler:
         return None
 
     def drop_excess(self, kept_voice: str, needed: Sequence[str]) -> list[VoiceDropOrder | VoiceWarning]:
-        """Choose the voices to drop to meet the memory limit, and return orders and warnings.
+        """Drop voices to meet the memory limit. Return the orders for the engine, and warnings.
 
-        This is necessary if the voices use more memory than was estimated.
+        This is necessary if the voices use more memory than estimated.
 
         Args:
             kept_voice: the voice that speaks now or next. It is never dropped.
@@ -301,7 +304,7 @@ class VoiceScheduler:
         return None if keep and total > self._limit_bytes else tuple(dropped)
 
     def _warn_too_large(self) -> list[VoiceWarning]:
-        """Return a warning the first time that a single loaded voice exceeds the memory limit."""
+        """Return a warning the first time a single loaded voice exceeds the memory limit."""
         loaded = self._loaded_bytes()
         voice = next(iter(loaded), "")
         taken = self._total_bytes()
@@ -312,7 +315,7 @@ class VoiceScheduler:
         return [VoiceWarning(f"voice {voice}: {why}")]
 
     def _forget_unneeded(self, needed: Collection[str]) -> None:
-        """Cancel the plans to load voices that are not in `needed`."""
+        """Cancel all plans to load voices that are not in `needed`."""
         for voice, found in list(self._voices.items()):
             if found.wanted and voice not in needed:
                 found.wanted = False

@@ -62,7 +62,7 @@ class ServerStatus:
 
     @classmethod
     def from_reply(cls, reply: JsonObject, items: list[JsonObject]) -> ServerStatus:
-        """Read a status from a reply and its list items."""
+        """Read a status from a reply and the list items before it."""
         lists = {name: [each[name] for each in items if name in each] for name in ("pending", "recent")}
         return cls.from_json({**reply, **lists})
 
@@ -96,9 +96,9 @@ class StateChanged:
     #: the time of the event, in seconds since 1970 UTC
     at: float | None = None
     #: the number of the event. A number is skipped if its event was for another client, or if a word was dropped
-    #: because this client reads slowly.
+    #: because this client reads too slowly.
     n: int | None = None
-    #: the whole goal, which only clients that watch all goals receive, in a goal's first and last event
+    #: the whole goal. Only clients that watch all goals receive it, in the goal's first and last event.
     goal: Goal | None = None
 
     def to_json(self) -> JsonObject:
@@ -238,7 +238,7 @@ def from_json(message: JsonObject) -> Event | None:
 
 
 def _event_json(kind: str, event: StateChanged | WordHeard | TextAdded | TextMissing | PausedChanged) -> JsonObject:
-    """Return the fields of an event's JSON object, except its goal.
+    """Return the JSON object of an event, without its goal.
 
     The caller converts enums and objects.
     """
@@ -247,12 +247,12 @@ def _event_json(kind: str, event: StateChanged | WordHeard | TextAdded | TextMis
 
 
 def goals(items: list[JsonObject], name: str) -> Iterator[Goal]:
-    """Yield the goals in this field of list items, or raise Unreadable."""
+    """Yield the goals in the list items that have this field. Raise Unreadable if one is malformed."""
     return (Goal.from_json(each[name]) for each in items if name in each)
 
 
 def goal_in(reply: JsonObject, name: str = "goal") -> Goal | None:
-    """Read a goal from a reply, or return None if the field is null.
+    """Read a goal from a field of a reply. Return None if the field is null.
 
     Raises Unreadable if the goal is malformed.
     """
@@ -296,9 +296,9 @@ def check_greeting(message: JsonObject) -> None:
 
 
 def item(seq: int | None, **fields: object) -> JsonObject:
-    """Return the message for a list item in the answer to the request number `seq`.
+    """Return the message for one list item of the answer to request `seq`.
 
-    The items are sent before the reply.
+    List items are sent before the reply.
     """
     return fields if seq is None else {"seq": seq, **fields}
 
@@ -314,7 +314,7 @@ def failure(seq: int | None, code: str, message: str, **fields: object) -> JsonO
 
 
 def take_seq(message: JsonObject) -> int | None:
-    """Remove and return a request's `seq` number, if it has one.
+    """Remove a request's `seq` number. Return the number, or None if there is none.
 
     Raises BadRequest if it isn't an integer.
     """

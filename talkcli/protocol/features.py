@@ -1,4 +1,4 @@
-"""Features of the protocol that not every server has.
+"""Features of the protocol that not every server supports.
 
 The server's greeting contains their names. A client that needs a feature checks for its name, and fails at once if the
 name is missing. Otherwise, an older server would refuse the request with a message about an unknown field or value.
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class Feature:
     """A feature of the protocol that older servers lack."""
 
-    #: what a server without the feature does not support, for error messages
+    #: the feature's name in error messages, for example "growing texts"
     name: str
     #: function that returns whether a request needs the feature
     is_needed: Callable[[JsonObject], bool]
@@ -32,5 +32,5 @@ FEATURES = {
 
 
 def missing_features(request: JsonObject, available: Collection[str]) -> list[str]:
-    """Return the names of the features that a request needs, but the server lacks."""
+    """Return the names of the features that a request needs and the server lacks."""
     return [name for name, each in FEATURES.items() if name not in available and each.is_needed(request)]

@@ -1,4 +1,4 @@
-"""Read and write lines of JSON, with one object per line.
+"""Read and write lines of JSON. Each line contains one object.
 
 Rules for this file: no I/O. It knows lines and their limits, but not what a request means. Any received bytes become an
 object or a BadRequest. The functions that need `json` or the errors import them, for two reasons: a client writes its
@@ -51,7 +51,7 @@ class LineSplitter:
         self.size = 0
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Add received bytes, and return the lines that are now complete.
+        """Add received bytes. Return the lines that are now complete.
 
         The lines don't contain their newlines. A line that is too long is truncated.
         """
@@ -83,7 +83,7 @@ class LineSplitter:
 
 
 def request_to_json(request: Request) -> JsonObject:
-    """Return a request's JSON object, without the default values."""
+    """Return a request as a JSON object, without default values."""
     message: JsonObject = {"request": request.kind}
     for option in request.options:
         value = getattr(request, option.name)
@@ -93,7 +93,7 @@ def request_to_json(request: Request) -> JsonObject:
 
 
 def request_line(message: JsonObject) -> bytes:
-    """Encode an object as a line of JSON, without importing `json` if possible."""
+    """Encode an object as a line of JSON. If possible, don't import `json`."""
     try:
         shown = ", ".join(f'"{name}": {_encode_simple(value)}' for name, value in message.items())
         return f"{{{shown}}}\n".encode()
@@ -102,7 +102,7 @@ def request_line(message: JsonObject) -> bytes:
 
 
 def _encode_simple(value: object) -> str:
-    """Encode a simple value as JSON, or raise TypeError if it needs the `json` module."""
+    """Encode a simple value as JSON. Raise TypeError if this needs the `json` module."""
     if isinstance(value, str):
         if value.isprintable() and '"' not in value and "\\" not in value:
             return f'"{value}"'
@@ -121,7 +121,7 @@ def _encode_simple(value: object) -> str:
 
 
 def encode(message: JsonObject) -> bytes:
-    """Encode an object as a line of JSON, or raise ValueError or TypeError.
+    """Encode an object as a line of JSON. Raise ValueError or TypeError if this is impossible.
 
     Text is written as UTF-8. Only lone surrogates, which UTF-8 can't hold, are escaped.
     """
@@ -133,7 +133,7 @@ def encode(message: JsonObject) -> bytes:
 
 
 def decode(line: bytes) -> JsonObject:
-    """Decode the JSON object in a line, or raise BadRequest if it is malformed or too long."""
+    """Decode a line that contains a JSON object. Raise BadRequest if it is malformed or too long."""
     from talkcli.errors import BadRequest, LineTooLong
 
     if isinstance(line, TruncatedLine):
@@ -176,7 +176,7 @@ def _json_function(name: str) -> Callable[[Any], Any]:
 
 
 def _create_object(pairs: list[tuple[str, object]]) -> JsonObject:
-    """Return an object with these keys and values, or raise ValueError for a repeated key."""
+    """Return an object with these keys and values. Raise ValueError if a key appears twice."""
     fields = dict(pairs)
     if len(fields) != len(pairs):
         raise ValueError("a key appears twice")
@@ -189,14 +189,14 @@ def _refuse_constant(name: str) -> object:
 
 
 def _parse_integer(digits: str) -> int:
-    """Convert digits to an integer, or raise ValueError if there are too many."""
+    """Convert digits to an integer. Raise ValueError if there are too many digits."""
     if len(digits) > MAX_DIGITS:
         raise ValueError(f"an integer has {len(digits):,} digits (at most {MAX_DIGITS})")
     return int(digits)
 
 
 def _parse_float(digits: str) -> float:
-    """Convert digits to a float, or raise ValueError if the number is too large."""
+    """Convert digits to a float. Raise ValueError if the number is too large."""
     number = float(digits)
     if not _is_finite(number):
         raise ValueError("a number is too large")

@@ -47,7 +47,7 @@ _COUNT_TYPE = Kind("integer", (int,), "must be an integer", check=_log_count_err
 
 @frozen
 class Hello:
-    """The first message of a client, which gives its name."""
+    """The first request of a client, which contains the client's name."""
 
     kind: ClassVar[str] = "hello"
     meaning: ClassVar[str] = "Identify the client. Send this first"
@@ -147,7 +147,7 @@ REQUEST_TYPES: dict[str, type[Request]] = {each.kind: each for each in Request._
 
 
 def read_request(message: JsonObject) -> Request:
-    """Return the request in a JSON object, or raise BadRequest if it is malformed.
+    """Read a request from a JSON object. Raise BadRequest if it is malformed.
 
     The caller must have removed `seq` from the object.
     """

@@ -1,4 +1,4 @@
-"""A client's connection, with its limits and its unanswered requests.
+"""The connection of a client, its limits and its unanswered requests.
 
 The connection passes requests to a `Handler`, which answers with `send`, `send_list` and `publish`. If a client doesn't
 read its replies, the server first drops its feedback and reads no more requests. If that is not enough, it closes the
@@ -36,7 +36,8 @@ if TYPE_CHECKING:
 
 #: A client with more unread output than this is disconnected.
 MAX_CLIENT_OUTPUT_BYTES = 4 * 1024 * 1024
-#: Maximum number of messages that wait while a list is sent to a client. With more, the client is disconnected.
+#: Maximum number of messages that wait while a list is sent to a client. If there are more, the client is
+#: disconnected.
 MAX_HELD_MESSAGES = 10_000
 #: Time limit for a client's first request. Clients send `hello` immediately.
 FIRST_REQUEST_S = 5.0
@@ -67,7 +68,7 @@ class Handler(Protocol):
         """Start to carry out a client's request."""
 
     def input_ended(self, connection: ClientConnection) -> None:
-        """Break off a client's incomplete texts, because it will send nothing more."""
+        """Break off a client's incomplete texts, because the client will send nothing more."""
 
     def is_waiting(self, connection: ClientConnection) -> bool:
         """Return whether a client is still waiting for a reply or an event."""
@@ -98,7 +99,7 @@ class PendingRequest:
         self._steps: Steps
 
     def start(self, steps: Steps) -> None:
-        """Run the coroutine `steps`, which handles the request, until it waits or ends.
+        """Run `steps`, the coroutine that handles the request, until it waits or ends.
 
         It must answer the request and must not raise.
         """
@@ -120,7 +121,7 @@ class PendingRequest:
             self._step(in_time)
 
     def move_to(self, waiting_list: WaitingList) -> None:
-        """Put the request into this waiting list, and remove it from its current one."""
+        """Move the request from its current waiting list to this one."""
         self._leave()
         self.waiting_list = waiting_list
         waiting_list[self] = None
@@ -168,7 +169,7 @@ class PendingRequest:
             self.move_to(self._steps.send(in_time))
 
     def _leave(self) -> bool:
-        """Remove the request from its waiting list, and return whether it was in one."""
+        """Remove the request from its waiting list. Return False if it is in none."""
         if self.waiting_list is None:
             return False
         del self.waiting_list[self]
@@ -184,12 +185,12 @@ def resume_all(waiting_list: WaitingList) -> None:
 
 @coroutine
 def _wait_in(waiting_list: WaitingList) -> Generator[WaitingList, bool, bool]:
-    """Suspend a request's coroutine in this list, and return whether it was resumed in time."""
+    """Suspend a request in this waiting list. Return whether it was resumed in time."""
     return (yield waiting_list)
 
 
 class ClientConnection(asyncio.Protocol):
-    """A client's connection, which reads its requests and sends replies and events.
+    """A client's connection, which reads requests and sends replies and events.
 
     If the server is full, a new client is admitted only when another client leaves, or when it sends an urgent request.
     """
@@ -308,7 +309,7 @@ class ClientConnection(asyncio.Protocol):
             self.send(held + event)
 
     def detect_hang_up(self) -> bool:
-        """Send pending output, and return whether the client has closed its socket."""
+        """Send pending output. Return whether the client has closed its socket."""
         self.stream.flush()
         return self.stream.closing
 
@@ -329,7 +330,7 @@ class ClientConnection(asyncio.Protocol):
         return self._loop.call_later(seconds, self.close_with, failure(None, "too_slow", message))
 
     def _update_reading(self) -> None:
-        """Start or stop reading, and the time limit for receiving a whole line.
+        """Start or stop reading. Start or cancel the time limit for the rest of a line.
 
         The server reads only while the client reads its replies and has few unprocessed lines.
         """
@@ -352,7 +353,7 @@ class ClientConnection(asyncio.Protocol):
             self._line_timer = None
 
     def _write(self, line: bytes) -> None:
-        """Write a line to the stream, or disconnect the client if too much output is unsent."""
+        """Write a line to the stream. Disconnect the client if too much output is unsent."""
         self.stream.write(line)
         if self.stream.unsent_bytes > MAX_CLIENT_OUTPUT_BYTES:
             self.stream.abort()

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 #: Maximum number of connections waiting to be accepted. The system also has a limit (net.core.somaxconn).
 MAX_BACKLOG_CONNECTIONS = 1024
-#: How long to wait until another server has written its process id to the lock file.
+#: How long to wait for another server to write its process id to the lock file.
 HOLDER_ID_S = 1.0
 #: The first file descriptor passed by systemd (SD_LISTEN_FDS_START).
 _FIRST_PASSED_FD = 3
@@ -71,7 +71,7 @@ class Listener:
         return _identity(self.path) == self._identity and _is_lock_of(self.path, self._lock)
 
     def bind_again(self) -> socket.socket | None:
-        """Recreate a missing socket or lock file, and return a replaced socket, if any.
+        """Recreate a missing socket or lock file. Return the old socket if it was replaced.
 
         Returns:
             The old socket, which the caller must close, or None if it is still in use.
@@ -140,7 +140,7 @@ def listen(path: str | None, mode: int) -> Listener | InheritedListener:
     The passed socket is used only if it has this path.
 
     Args:
-        path: the path of the socket file, or None for any passed socket, or else the usual place.
+        path: the path of the socket file. With None, any passed socket is used, or else the usual place.
         mode: the mode of a new socket file.
     """
     passed = os.environ.get("LISTEN_FDS")
@@ -169,7 +169,7 @@ def _raise_in_use(problem: str) -> Iterator[None]:
 
 
 def _identity(path: str) -> tuple[int, int] | None:
-    """Return the device and inode numbers of a file, if it can be accessed."""
+    """Return the device and inode numbers of a file, or None if it can't be accessed."""
     try:
         status = os.lstat(path)
     except OSError:
@@ -191,7 +191,7 @@ def _already_served(pid: int | None, path: str, *, on_this_machine: bool) -> Add
 
 
 def _path_of(passed: socket.socket) -> str:
-    """Return the path of a socket passed by systemd, or raise UsageError if it has none.
+    """Return the path of a socket passed by systemd. Raise UsageError if it has none.
 
     It must be a listening Unix socket.
     """
@@ -239,7 +239,7 @@ def _refuse_live_socket(path: str) -> None:
 
 
 def _prepare_directory(directory: str) -> None:
-    """Create the socket's directory if necessary, or raise AddressInUse if it isn't safe.
+    """Create the socket's directory if necessary. Raise AddressInUse if it isn't safe.
 
     It isn't safe if other users could replace the socket in it.
     """
@@ -276,7 +276,7 @@ def _refuse_other_file(path: str) -> None:
 
 
 def _bind(path: str, mode: int) -> socket.socket:
-    """Return a new socket that listens at the path, after removing an old socket file.
+    """Remove an old socket file. Return a new socket that listens at the path.
 
     The caller must hold the lock.
     """
@@ -296,7 +296,7 @@ def _bind(path: str, mode: int) -> socket.socket:
 
 
 def _acquire_lock(path: str) -> int:
-    """Lock a socket's path and return the lock file's descriptor, or raise AddressInUse.
+    """Lock a socket's path. Return the descriptor of the lock file, or raise AddressInUse.
 
     The file contains the id of this process. Closing the descriptor ends the lock.
     """
@@ -323,7 +323,7 @@ def _is_lock_of(path: str, fd: int) -> bool:
 
 
 def _open_lock(path: str) -> int:
-    """Open or create a lock file, and return its descriptor.
+    """Open or create a lock file. Return its descriptor.
 
     Raises AddressInUse if it isn't a plain file.
     """
@@ -364,7 +364,7 @@ def _process_exists(pid: int) -> bool:
 
 
 def _read_holder(fd: int) -> int | None:
-    """Wait briefly for a server's process id in its lock file, and return it, if any.
+    """Wait briefly until a lock file contains its holder's process id. Return the id, if any.
 
     The id of a process that no longer exists was written by an earlier server, and is ignored.
     """

@@ -89,7 +89,7 @@ class Requests:
         self.input_ended(connection)
 
     def input_ended(self, connection: ClientConnection) -> None:
-        """Break off a client's incomplete texts, because it will send nothing more."""
+        """Break off a client's incomplete texts, because the client will send nothing more."""
         for record in [record for record, producer in self._producers.items() if producer is connection]:
             del self._producers[record]
             self._speech.apply(self._scheduler.producer_left(record, self._speech.advance_time()))
@@ -126,7 +126,7 @@ class Requests:
     # -- requests that wait
 
     def _awaiting_voices(self, connection: ClientConnection) -> list[PendingRequest]:
-        """Return the requests of a connection that are waiting for the list of voices."""
+        """Return a connection's requests that are waiting for the list of voices."""
         return [each for each in connection.unanswered if each.waiting_list is self._speech.waiting_for_voices]
 
     def _must_await_voices(self, pending: PendingRequest) -> bool:
@@ -138,12 +138,12 @@ class Requests:
         return self._speech.awaits_voices and (names_voice or isinstance(request, Voices))
 
     def _stop_awaiting_voices(self, connection: ClientConnection) -> None:
-        """Continue the requests of a connection that wait for the list of voices."""
+        """Resume a connection's requests that are waiting for the list of voices."""
         for each in self._awaiting_voices(connection):
             each.resume()
 
     def _reserve_memory(self, pending: PendingRequest) -> bool:
-        """Count a waiting request's memory. If too many wait, set `refusal` and return False.
+        """Count the memory of a waiting request. If too many wait, set `refusal` and return False.
 
         The request is then carried out without waiting, and the refusal rejects its goal.
         """
@@ -168,7 +168,7 @@ class Requests:
             self._room_check = asyncio.get_running_loop().call_soon(self._submit_waiting_goals)
 
     def _submit_waiting_goals(self) -> None:
-        """Continue waiting `say` requests if the queue now has room."""
+        """Resume waiting `say` requests if the queue now has room."""
         self._room_check = None
         without_room: set[object] = set()
         for each in list(self._speech.waiting_for_room):
@@ -194,7 +194,7 @@ class Requests:
         return [each for each in selected if not each.connection.detect_hang_up()]
 
     def _cancel_waiting(self, goals: list[PendingRequest], by: By | None) -> list[Callable[[], None]]:
-        """Mark waiting goals as cancelled, and return functions that end them.
+        """Mark waiting goals as cancelled. Return the functions that end them.
 
         The functions submit the goals to the scheduler, which recalls them.
         """
@@ -205,7 +205,7 @@ class Requests:
         return [each.resume for each in new]
 
     async def _await_room(self, pending: PendingRequest, say: Say) -> float:
-        """Wait until the queue has room or the goal expires, and return the waiting time."""
+        """Wait until the queue has room or the goal expires. Return the waiting time in seconds."""
         ttl = (self._scheduler.settings.ttl if say.ttl is None else say.ttl) or None
         began = self._speech.advance_time().monotonic
         self._speech.subscribers.schedule_keep_alive()
@@ -216,7 +216,7 @@ class Requests:
     # -- coroutines, named after the requests that they handle
 
     async def _say(self, pending: PendingRequest, say: Say) -> None:
-        """Submit a goal, which first waits for room if it is `patient`, and reply.
+        """Submit a goal, and reply. A `patient` goal first waits for room in the queue.
 
         The reply shows the goal as it was accepted.
         """
@@ -277,7 +277,7 @@ class Requests:
         pending.answer(length=len(record.say.text), state=record.state.name)
 
     def _require_producer(self, record: Record, connection: ClientConnection) -> None:
-        """Let a connection add text to a goal, or raise RequestRefused if another one does.
+        """Let a connection add text to a goal. Raise RequestRefused if another connection does.
 
         A new connection may continue a text if the old one is gone and the sender chose the goal's id.
         """
@@ -293,7 +293,7 @@ class Requests:
         return producer is None or producer.detect_hang_up()
 
     def _check_goal(self, pending: PendingRequest, say: Say) -> tuple[Say, Refusal | None]:
-        """Return a goal with the id of its voice, and the reason to refuse it, if any.
+        """Look up a goal's voice. Return the goal with the voice's id, and a reason to refuse it, if any.
 
         Refusals that need a clock, files or other I/O belong here. The scheduler decides about all others.
         """
@@ -305,7 +305,7 @@ class Requests:
         return say, pending.refusal or refusal
 
     async def _wait(self, pending: PendingRequest, request: Wait) -> None:
-        """Reply with goals, and send each goal's result, now or when it ends."""
+        """Reply with the goals, and send the result of each goal once it has ended."""
         await self._speech.notifications.wait_done(pending)  # send earlier events of a goal before its result
         if request.ids is None:
             records = self._scheduler.unfinished()
@@ -415,7 +415,7 @@ class Requests:
         self._speech.subscribers.watch(pending.connection)
 
     def _answer_overview(self, pending: PendingRequest) -> None:
-        """Reply with the state of the server and with its active, pending and recent goals."""
+        """Reply with the state of the server, and its active, pending and recent goals."""
         recent = self._scheduler.history.latest(RECENT_GOALS, include_rejected=False)
         active = self._scheduler.active
         now = active.snapshot().to_json() if active else None

@@ -1,4 +1,4 @@
-"""The server behind `talk serve`: start, admission of clients, status and shutdown."""
+"""The server behind `talk serve`: how it starts, admits clients, reports its status and shuts down."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class ServerSettings:
 
 
 def serve(settings: ServerSettings) -> int:
-    """Run a server until it receives SIGTERM or SIGINT, and return the exit code.
+    """Run a server until it receives SIGTERM or SIGINT. Return the exit code.
 
     Raises:
         AddressInUse: if another server is running, or the socket's directory isn't safe.
@@ -92,7 +92,7 @@ def serve(settings: ServerSettings) -> int:
 
 
 class Server:
-    """The server behind `talk serve`, with its goals, its engine and its clients.
+    """The server behind `talk serve`, and its goals, engine and clients.
 
     Create it inside a running event loop.
     """
@@ -183,9 +183,9 @@ class Server:
             raise self._fatal_error
 
     def _apply_configured_voice(self) -> str | None:
-        """Set a configured neural voice, or return another voice, which the engine must check.
+        """Apply the configured voice if it is neural. Otherwise, return it, if any.
 
-        A neural voice is loaded later, so that it doesn't delay speech.
+        The engine must check a voice that is returned. A neural voice is loaded later, so that it doesn't delay speech.
 
         Raises:
             UsageError: if a neural voice is unknown.

@@ -54,14 +54,14 @@ REPORTS_PER_TURN = 8
 #: Maximum length of a program's name or command line in the log.
 _MAX_LOGGED_COMMAND_CHARS = 80
 _NO_PLAYER_NEEDED = "no player needed"
-#: An `append` is answered when no more characters of the text than this are still unheard.
+#: An `append` is answered when at most this many characters of the text are still unheard.
 MAX_UNHEARD_CHARS = 10_000
 
 require_fields(protocol.Speak, ENGINE_OPTIONS)
 
 
 def unheard_chars(record: Record) -> int:
-    """Return how many characters that can be spoken have not been heard yet.
+    """Return how many characters of a goal's text can be spoken, but have not been heard yet.
 
     If a goal waits for text, the rest of its text can't be spoken yet, or contains no words, such as a block of code.
     """
@@ -167,7 +167,7 @@ class Speech:
     # -- the scheduler's effects
 
     def advance_time(self) -> Now:
-        """Handle all time limits that have been reached, and return the current time."""
+        """Handle all time limits that have been reached. Return the current time."""
         now = Now(monotonic_now(), time.time())
         if self.scheduler.deadline() <= now.monotonic:
             self.apply(self.scheduler.tick(now))
@@ -209,7 +209,7 @@ class Speech:
                 log.write(log.sanitize(message))
 
     def _give_order(self, record: Record, order: Order) -> None:
-        """Give the engine an order concerning a goal."""
+        """Give the engine an order about a goal."""
         match order:
             case Order.START:
                 self._start_speaking(record)
@@ -225,7 +225,7 @@ class Speech:
                 self.engine.resume(record.id)
 
     def _start_speaking(self, record: Record) -> None:
-        """Tell the engine to speak a goal, or fail it if its voice is unavailable."""
+        """Tell the engine to speak a goal. If the goal's voice is unavailable, fail the goal."""
         self._announced_next = next_waits, next_is_neural = self._describe_next()
         options = engine_options(record.say, self.scheduler.settings)
         if not is_neural(options["voice"] or ""):
@@ -320,7 +320,7 @@ class Speech:
             self._process_engine_event(report, now)
 
     def _process_goal_event(self, event: protocol.GoalEvent, active: Record, now: Now) -> None:
-        """Process the engine's report about the active goal."""
+        """Process a report about the active goal."""
         scheduler = self.scheduler
         match event:
             case protocol.TextMissing():
@@ -352,7 +352,7 @@ class Speech:
                     resume_all(self.waiting_for_silence(active))
 
     def _process_voice_event(self, event: protocol.VoiceEvent, now: Now) -> None:
-        """Process the engine's report about a voice or its list of voices."""
+        """Process a report about a voice, or the engine's list of voices."""
         scheduler = self.scheduler
         match event:
             case protocol.VoiceList():
@@ -389,7 +389,7 @@ class Speech:
                     self.apply(self.scheduler.failed(active.id, Reason.ENGINE_FAILED, event.message, None, now))
 
     def _end_active_goal(self, ended: protocol.Ended, active: Record, now: Now) -> None:
-        """End the active goal after the engine's report."""
+        """End the active goal after the engine has reported its end."""
         scheduler = self.scheduler
         if self.ready and ended.player:  # let `status` show the player that was used
             self.ready = replace(self.ready, player=ended.player)

@@ -172,7 +172,7 @@ class ClientStream:
         return len(self._unread)
 
     def count_held(self, added_bytes: int) -> None:
-        """Adjust the size of the output that the receiver holds back, and enforce the limit."""
+        """Adjust the size of the output that the receiver holds back. Enforce the total limit."""
         if self in self._streams.open:
             self.held_bytes += added_bytes
             self._streams.unread_bytes += added_bytes
@@ -271,7 +271,7 @@ class ClientStream:
 
 
 def raise_descriptor_limit(clients: int) -> int:
-    """Raise the limit of open files to fit this number of clients, and return the limit."""
+    """Raise the limit of open files to fit this number of clients. Return the limit."""
     wanted = clients + RESERVED_DESCRIPTORS + OWN_DESCRIPTORS
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     allowed, most = (2**31 if each == resource.RLIM_INFINITY else each for each in limits)

@@ -36,7 +36,7 @@ _UNREAD_LIMIT_BYTES = 1024 * 1024
 _READ_TIME_S = 0.05
 #: How often to check whether clients have read their output.
 _READ_CHECK_S = 0.002
-#: Factor that shortens the wait each time that clients don't read. All waits add up to 0.8 s, so that a cancel is
+#: Factor that shortens the wait each time clients don't read. All waits add up to 0.8 s, so that a cancel is
 #: answered within 2 s even if no client reads.
 _READ_TIME_FACTOR = 0.94
 
@@ -100,7 +100,7 @@ class Subscribers:
                 connection.publish(lines)
 
     def word_heard(self, word: Word, text: str, at: float) -> None:
-        """Send a word that is being spoken to the connections that want feedback.
+        """Send a word that is being spoken to the clients that want feedback.
 
         Args:
             word: the engine's event.
@@ -111,7 +111,7 @@ class Subscribers:
         _publish(event.to_json(), self._feedback_receivers([self._waiters.get(word.id, {})]), feedback=True)
 
     def text_added(self, goal_id: str, start: int, text: str, at: float) -> None:
-        """Publish to watching connections that a goal's text has grown.
+        """Tell watching clients that a goal's text has grown.
 
         The new text begins at the offset `start`.
         """
@@ -119,12 +119,12 @@ class Subscribers:
             _publish(TextAdded(goal_id, start, text, at, next(self._numbers)).to_json(), self._watchers)
 
     def text_missing(self, goal_id: str, at: float, *, waits: bool) -> None:
-        """Publish to the connections that want feedback whether a goal waits for text."""
+        """Tell clients that want feedback whether a goal waits for text."""
         event = TextMissing(goal_id, waits, at, next(self._numbers))
         _publish(event.to_json(), self._feedback_receivers([self._waiters.get(goal_id, {})]))
 
     def paused_changed(self, goal_id: str | None, *, paused: bool, by: By, at: float) -> None:
-        """Publish that speech was paused or resumed.
+        """Tell clients that want feedback that speech was paused or resumed.
 
         `goal_id` is the id of the affected goal, if any.
         """
@@ -137,7 +137,7 @@ class Subscribers:
             self._alive_timer = self._loop.call_later(CLIENT_ALIVE_INTERVAL_S, self._send_alive)
 
     def _feedback_receivers(self, waiters: Iterable[dict[ClientConnection, bool]]) -> dict[ClientConnection, None]:
-        """Return all connections that watch, and the waiting ones that want feedback."""
+        """Return all connections that watch, and all waiting connections that want feedback."""
         listeners = dict(self._watchers)
         for each in waiters:
             listeners.update((connection, None) for connection, feedback in each.items() if feedback)

@@ -24,8 +24,8 @@ LONG = "x" * MAX_TEXT_CHARS
 
 def sent(sender: TextSender) -> Iterator[Say | Append]:
     """Accept and yield all requests that can be sent now."""
-    while request := sender.next_request():
-        assert sender.next_request() is request  # it can be sent again until it is answered
+    while request := sender.request_to_send():
+        assert sender.request_to_send() is request  # it can be sent again until it is answered
         sender.accepted("a")
         yield request
 
@@ -90,14 +90,14 @@ def test_the_server_gets_the_whole_text_with_its_offsets(writes: list[str]) -> N
 def test_text_that_the_server_refused_is_dropped() -> None:
     sender = TextSender(Say("", more=True))
     sender.write("One. ")
-    sender.next_request()
+    sender.request_to_send()
     sender.accepted("a")
     sender.write("\0")
-    sender.next_request()
+    sender.request_to_send()
     sender.refused()
-    assert sender.next_request() is None
+    assert sender.request_to_send() is None
     sender.write("Two.")
-    assert sender.next_request() == Append("a", "Two.", 5)
+    assert sender.request_to_send() == Append("a", "Two.", 5)
 
 
 # Standard input
