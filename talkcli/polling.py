@@ -1,4 +1,4 @@
-"""A function that waits for file descriptors, with a time limit.
+"""A function that waits until file descriptors are ready or the time is up.
 
 Other descriptors can interrupt the wait.
 """

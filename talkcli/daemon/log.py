@@ -80,7 +80,7 @@ def write(message: str) -> None:
 
 
 def write_limited(kind: str, message: str) -> None:
-    """Write a line to the log, at most once a minute for each kind.
+    """Write a line to the log, at most once a minute for each kind of line.
 
     The next line of the same kind gives the number of suppressed lines.
     """

@@ -1,4 +1,4 @@
-r"""Markdown, reduced to the text that listeners should hear.
+r"""Code that reduces Markdown to the text that listeners should hear.
 
 The marks become blanks, so the result has the same length as the text, and offsets in it are offsets in the text.
 

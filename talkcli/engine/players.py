@@ -222,7 +222,7 @@ def sound_server_sockets(env: Mapping[str, str], *uids: int) -> list[str]:
 
 
 def has_no_output(env: Mapping[str, str], snd_dir: str = "/dev/snd", etc_dir: str = "/etc") -> bool:
-    """Return whether this process certainly can't play any sound.
+    """Return whether it is certain that this process can't play any sound.
 
     This only looks at file names, so that no sleeping device wakes up. Any custom configuration counts as an output,
     because it may lead to any device.

@@ -224,7 +224,7 @@ class StartFailed:
 class VoiceList:
     """All voices that the driver offers.
 
-    It is sent once, right after `Ready`, if `Configure.list_voices` is true.
+    The process sends this once, right after `Ready`, if `Configure.list_voices` is true.
     """
 
     voices: tuple[Voice, ...]
@@ -250,7 +250,7 @@ class VoiceUnloaded:
 class VoiceMemory:
     """The memory used by neural voices.
 
-    It is sent before `VoiceLoaded`, and after a sentence or a `DropVoice`.
+    The process sends this before `VoiceLoaded`, and after a sentence or a `DropVoice`.
     """
 
     voice: str  # ID of the voice that was loaded or used, without a speaker; empty after `DropVoice`
@@ -273,7 +273,7 @@ class Alive:
 
 @frozen
 class Word:
-    """The start of a word in the sound. The process sends it when the word is heard."""
+    """The start of a word in the sound. The process sends this when the word is heard."""
 
     id: str
     start: int  # offset of the word's first character in the text
@@ -294,7 +294,7 @@ class TextMissing:
 class OutputChanged:
     """The device, volume and mute state of the current output.
 
-    It is sent when they become known or change.
+    The process sends this when they become known or change.
     """
 
     id: str
@@ -305,7 +305,7 @@ class OutputChanged:
 class VoiceChosen:
     """The voice that speaks the sentence.
 
-    It is sent again if a fallback voice replaces it before the first word.
+    The process sends this again if a fallback voice replaces it before the first word.
     """
 
     id: str

@@ -257,7 +257,7 @@ def _describe_time_left(goal: Goal, now: float) -> str | None:
 
 
 def _describe_sender(sender: Sender | None) -> str:
-    """Describe a sender with its command, process id, user id and name."""
+    """Describe a sender by its command, process id, user id and name."""
     if sender is None:
         return _UNKNOWN_SENDER
     parts = [
@@ -387,7 +387,7 @@ def _file_name(path: str) -> str:
 
 
 def _format_status_fields(server: JsonObject, *names: str) -> list[str]:
-    """Format the named fields of the server's status, without empty optional ones."""
+    """Format the named fields of the server's status. Leave out empty optional fields."""
     shown = [each for each in names if server.get(each) or each not in _OPTIONAL_FIELDS]
     return [_FIELD_FORMATS.get(each, f"{each} {{}}").format(_format_status_field(server, each)) for each in shown]
 

@@ -92,7 +92,7 @@ class Screen:
         return self.fit_name(number if number.isdecimal() else goal_id, _MIN_ID_COLUMNS, 8)
 
     def coloured(self, text: str, state: State | None) -> str:
-        """Colour a text by its state, or make it bold if the state is None.
+        """Colour a text by a goal state, or make it bold if the state is None.
 
         Without colours, return it unchanged.
         """

@@ -76,7 +76,7 @@ RELEASE_DELAY_S = 10.0
 #: 78 ms, and pacat 25 to 60 ms.
 MIN_PLAYER_BUFFER_S = 0.02
 
-#: Samples up to this absolute value count as silence. It is 66 dB below the loudest possible sample (32,768).
+#: Samples up to this absolute value count as silence. This is 66 dB below the loudest possible sample (32,768).
 #: libespeak-ng ends a sentence with 235 to 275 ms of zeros. If the voice has an echo ("f3"), the last 100 ms or so are
 #: quiet, but not zero.
 MAX_QUIET_LEVEL = 16
@@ -285,15 +285,15 @@ class Playback:
         self._in_background = False
         #: whether the player may have run dry because the text was missing, which doesn't count as a gap
         self._text_was_missing = False
-        #: offset in the text, and in the samples, of the part of the text that is being synthesized
+        #: start of the part that is being synthesized, as offsets in the text and in the samples
         self._part_start = self._part_begin = 0
-        #: whether another part may follow, which can be synthesized during the pause before it
+        #: whether another part may follow. It can be synthesized during the pause before it.
         self._part_follows = False
         #: lengths in seconds of the gaps caused by late samples
         self.gaps: list[float] = []
         #: time at which the player began to play silence during a pause
         self._silent_at: float | None = None
-        #: seconds of the sentence that were heard, once the player was killed
+        #: seconds of the sentence that had been heard when it was stopped; None before that
         self._heard: float | None = None
 
     # -- methods for the synthesizer
@@ -413,7 +413,7 @@ class Playback:
             self._feed.player.kill()
 
     def silence(self) -> None:
-        """Kill the player, and wait until it is certainly silent.
+        """Kill the player, and wait until it is silent.
 
         Raises:
             CannotEnd: the player has not exited in time.

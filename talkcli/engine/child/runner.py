@@ -63,7 +63,7 @@ class Channel:
         self._lines = LineSplitter()
 
     def send(self, event: protocol.Event) -> None:
-        """Send an event, blocking until all of it is written."""
+        """Send an event. Block until all of it is written."""
         data = memoryview(protocol.encode(event))
         self.sent_at = time.monotonic()
         try:
@@ -128,7 +128,7 @@ class ActiveGoal:
         self.overdue_logged = False
 
     def append(self, command: protocol.Append, now: float) -> None:
-        """Add text to a growing text, or end it."""
+        """Add text to the goal, or mark its text as complete."""
         assert self.growing_text
         text = self._remove_markdown(command.text, ended=command.end)
         self.growing_text.append(text, now)
@@ -143,7 +143,7 @@ class ActiveGoal:
         return self._markdown.read(text, ended=ended) if self._markdown else text
 
     def speech_seconds(self, now: float) -> float:
-        """Return how long a third-party driver has spoken the goal, in seconds without pauses."""
+        """Return for how many seconds a third-party driver has been speaking, not counting pauses."""
         return self.spoken_s + (now - self.resumed_at if self.with_driver else 0.0)
 
 
@@ -457,7 +457,7 @@ class GoalRunner:
         return self._channel.sent_at + protocol.ALIVE_INTERVAL_S
 
     def _notice_overdue(self, goal: ActiveGoal) -> bool:
-        """Return whether a third-party driver takes too long, and log this once for each goal.
+        """Return whether a third-party driver is taking too long. Log this once for each goal.
 
         The process then sends no `Alive`, so that the server kills it. There may be no other way to stop the driver.
         """

@@ -21,7 +21,7 @@ _END_MARKS = ".,;:!?…"
 
 
 def count_letters(text: str, start: int) -> int:
-    """Count the letters, digits and combining accents that begin at `start`.
+    """Count the consecutive letters, digits and combining accents from `start` on.
 
     The result is used as the length of a word if libespeak-ng reports a length of 0. libespeak-ng does so if the next
     character isn't ASCII (as in "«hello»"), and also if there is no word at all.
@@ -50,7 +50,7 @@ class WordFinder:
         self._text += text
 
     def find(self, location: int, length: int) -> tuple[int, int, int] | None:
-        """Return the start, end and number of the word at a location, or None if it isn't new.
+        """Return the start, end and number of the word at a location, or None if the word isn't new.
 
         The first word has number 1.
         """

@@ -331,7 +331,7 @@ class Supervisor:
             yield self._last_sign_at + HANG_LIMIT_S, f"{no_sign} while loading {self._loading}"
 
     def _handle_deadlines(self, now: float) -> None:
-        """Kill processes that have missed a deadline, and start a new one if it is due."""
+        """Kill processes that have missed a deadline, and start a new process if one is due."""
         missed = next((message for deadline, message in self._deadlines() if now >= deadline), None)
         if missed:
             self._lose_process(missed, Reason.ENGINE_HUNG)
@@ -476,7 +476,7 @@ class Supervisor:
         self._watched |= dict.fromkeys((process.socket.fileno(), process.liveness, process.stderr), process)
 
     def _report_stderr(self, line: str) -> None:
-        """Post a line of a process's standard error, unless there are too many."""
+        """Post a line of a process's standard error, unless there have been too many."""
         omitted = self._stderr_quota.count_event(time.monotonic())
         if omitted:
             self._post(EngineSaid(f"({omitted} lines were omitted)"))

@@ -140,7 +140,7 @@ class Player(Protocol):
         """
 
     def kill(self) -> None:
-        """Stop playing at once, and start to release all resources.
+        """Stop playing at once, and start releasing all resources.
 
         This method never raises an exception, and may be called again.
         """

@@ -200,7 +200,7 @@ class PulsePlayer(Player):
 
     @property
     def output(self) -> Output | None:
-        """The sink, its volume and mute state; None until the server reports them."""
+        """The sink, its volume and its mute state, or None until the server reports them."""
         sink, stream = self._sink_level, self._stream_level
         if self.device is None or sink is None or stream is None or self._is_volume_pending():
             return None
@@ -270,7 +270,7 @@ class PulsePlayer(Player):
         return True
 
     def _follow_sink(self) -> bool:
-        """React if the sink was changed or suspended. Return whether requests were sent."""
+        """Handle a change or suspension of the sink. Return whether requests were sent."""
         index = int(self._lib.stream_get_device_index(self._stream))
         changed = index != self._sink_index
         if changed:

@@ -27,7 +27,7 @@ MAX_PART_PHONEMES = 250
 _MAX_SECTION_PHONEMES = MAX_PART_PHONEMES - 1
 #: If a part is longer than this, it ends at the next comma instead of at the end of the sentence.
 _LONG_PART_PHONEMES = 150
-#: The maximum number of comparisons to align two strings of phonemes, which takes up to 50 ms. This is enough for a
+#: The maximum number of comparisons for aligning two strings of phonemes. They take up to 50 ms. This is enough for a
 #: clause of 1,000 phonemes. libespeak-ng ends every clause after 800 bytes, so only very long numbers exceed the limit.
 #: In such a number, the exact positions of words don't matter.
 _MAX_COMPARISONS = 1 << 20
@@ -125,7 +125,7 @@ def split_text(phonemizer: Phonemizer, text: str, *, ends_text: bool = True) -> 
 
 
 def _split_long_groups(phoneme_groups: Sequence[str]) -> Iterator[str]:
-    """Yield groups of phonemes, and cut those that are too long for one run of a model."""
+    """Yield the groups of phonemes. Split those that are too long for one run of a model."""
     for group in phoneme_groups:
         for begin in range(0, len(group), _MAX_SECTION_PHONEMES):
             yield group[begin : begin + _MAX_SECTION_PHONEMES]
