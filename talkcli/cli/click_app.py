@@ -121,7 +121,7 @@ def _make_click_argument(argument: Option) -> click.Argument:
 
 
 def _make_completer(completer: str) -> Callable[..., list[CompletionItem]] | None:
-    """Return the function with which click completes a value, or None without a completer."""
+    """Return a function that completes a value for click, or None if there is no completer."""
 
     def complete(context: click.Context, _: click.Parameter, incomplete: str) -> list[CompletionItem]:
         from talkcli.cli import completion

@@ -126,7 +126,7 @@ def _last_word(line: str) -> tuple[str, str]:
 
 
 def _with_flag(value: str, incomplete: str) -> str:
-    """Prefix a value with its flag if the incomplete word is --option=VALUE."""
+    """Put the flag in front of a value if the incomplete word is --option=VALUE."""
     option, equals, _ = incomplete.partition("=")
     return f"{option}={value}" if equals and option.startswith("-") else value
 

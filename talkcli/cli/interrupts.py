@@ -125,7 +125,7 @@ class Interrupts:
             os.read(self._descriptor, 16)
 
     def _handle_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
-        """Record the first signal. Exit the process on a second signal, unless that is SIGHUP."""
+        """Record the first signal. Exit the process on a second signal, unless it is SIGHUP."""
         if self.signal_number is not None:
             if number == signal.SIGHUP:
                 return

@@ -89,7 +89,7 @@ def _flag_table(options: Iterable[Option]) -> Flags:
 
 
 def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, Any]) -> None:
-    """Parse an option, with its argument from `rest` if needed, and store its value in `given`.
+    """Parse one option, and store its value in `given`. Take a separate argument from `rest`.
 
     Raises:
         KeyError, ValueError, StopIteration: click has to parse the option.

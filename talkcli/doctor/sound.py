@@ -380,7 +380,7 @@ def _find_pulse_address(env: Mapping[str, str]) -> str | None:
 
 
 def check_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[str], *, in_use: bool) -> list[Finding]:
-    """Return findings about the volume of the sound server's output, or else of the sound cards.
+    """Return findings about the volume of the sound server's output or, without a sound server, of the cards.
 
     Args:
         env: the environment of the player.

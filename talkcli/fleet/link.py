@@ -227,7 +227,7 @@ class Link:
                 self._paho.loop_misc()
 
     def publish(self, message: Message, qos: int = 1, on_acknowledged: OnAcknowledged | None = None) -> bool:
-        """Publish a message, or return False if the connection has ended.
+        """Publish a message. Return False if the connection has ended.
 
         Args:
             message: the message. Its payload has at most `max_payload_bytes`.

@@ -34,7 +34,7 @@ class Message:
     retained: bool = False
     #: topic for the reply; None if the sender doesn't want one
     response: str | None = None
-    #: data that the reply must repeat; None if the sender gave none
+    #: data that the reply must repeat; None if the message has none
     correlation: bytes | None = None
     #: seconds until the message expires; None if it never does
     expiry: float | None = None

@@ -142,7 +142,7 @@ class Bridge:
         )
         self._publisher = Publisher(self._sessions, self._publish_to_all, self._on_server_change)
         offline = {"talk": PROTOCOL, "online": False, "session": self._session, "groups": groups}
-        #: the message that reports that the robot is offline
+        #: the message that reports the robot as offline
         self._will = Message(self._presence_topic, encode(offline), retained=True)
         self._link: Link | None = None
         #: the link's descriptor while the event loop watches it, otherwise -1

@@ -1,4 +1,4 @@
-"""Publishes a robot's status and goal events to all subscribers.
+"""The publisher of a robot's status and events, which all subscribers receive.
 
 The publisher watches the robot's server as long as the bridge runs. If the broker is too slow, events are dropped. If a
 payload is too long for the broker, it is published without texts.

@@ -92,7 +92,7 @@ class DeskLink:
         self.failure: TalkError | None = None
         #: when the marker message came back after the retained messages (monotonic time), or None until then
         self.marker_at: float | None = None
-        #: functions that process received messages and rejected requests; `poll` calls them without locking the link
+        #: functions that process messages and rejected requests. `poll` calls them when the link isn't locked.
         self._calls: deque[Callable[[], object]] = deque()
         self._opening: LinkOpener | None = None
         self._failed_attempts = 0

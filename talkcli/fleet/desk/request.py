@@ -1,4 +1,4 @@
-"""Classes to select robots for a request, and to describe its outcome on each robot.
+"""Classes that select robots for a request and describe its outcome on each robot.
 
 The module is pure.
 """

@@ -42,7 +42,7 @@ _CHECK_INTERVAL_S = 0.25
 #: The maximum number of messages to process before a check for late robots. There may be many messages if this process
 #: was suspended.
 _MAX_MESSAGES_PER_CHECK = 5000
-#: How long `close` waits until the broker has acknowledged the request.
+#: How long `close` waits for the broker to acknowledge the request.
 _FLUSH_LIMIT_S = 1.0
 
 

@@ -1,4 +1,4 @@
-"""Functions to format the state of a fleet as a table, and its events as lines.
+"""Functions that format the state of a fleet as a table, and its events as lines.
 
 The module is pure. The caller passes the time and the properties of the terminal.
 """

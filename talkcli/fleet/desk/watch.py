@@ -1,4 +1,4 @@
-"""Functions to read the state of a fleet, or to watch it for changes.
+"""Functions and classes that read the state of a fleet or watch it for changes.
 
 Nothing is sent to the robots. If the connection to the broker was lost for a while, FleetWatch compares the retained
 messages with the state before that. They contain each robot's presence, its active goal, and the goal that ended last.
