@@ -284,10 +284,14 @@ class Word:
 
 @frozen
 class TextMissing:
-    """The goal has become silent because text is missing, or it has continued."""
+    """The goal has become silent because text is missing, or it has continued.
+
+    While the goal is silent, the event is repeated after long additions that can't be spoken yet.
+    """
 
     id: str
     missing: bool
+    length: int  # number of characters of the text that the process has received
 
 
 @frozen

@@ -61,6 +61,8 @@ class Record:
     broken: bool = False
     #: whether the goal is silent because the next part of its text is missing
     waits: bool = False
+    #: number of characters that were heard, or that were not spoken before the goal waited for text
+    passed_chars: int = 0
     #: monotonic time by which more text must arrive, or inf
     stalls_at: float = inf
     #: if the sender left, monotonic time by which another connection must continue the text, otherwise inf

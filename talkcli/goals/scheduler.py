@@ -335,6 +335,7 @@ class Scheduler:
         if record.state is State.PENDING:
             return self._recall(record, Reason.BROKEN_OFF, _BROKEN_OFF, None, now) + self._order_next_voice(now)
         record.more, record.broken = False, True
+        self._reset_stall_limit(record, now)
         return self._stop(record, Reason.BROKEN_OFF, None, now) if at_once else [EngineOrder(record, Order.APPEND)]
 
     def change_settings(self, changes: dict[str, object], now: Now) -> list[Effect]:
@@ -438,6 +439,7 @@ class Scheduler:
             opening = [] if between[-1:].isspace() else between.split()[-1:]  # a quotation mark before the new word
             record.spoken_end = record.begun_end + len(between.removesuffix("".join(opening)).rstrip())
         record.begun_end = max(record.begun_end, end)
+        record.passed_chars = max(record.passed_chars, end)
         self.audio_heard(goal_id, seconds)
 
     def audio_heard(self, goal_id: str, seconds: float) -> None:
@@ -445,12 +447,15 @@ class Scheduler:
         record = self._require_active(goal_id)
         record.heard = max(record.heard, seconds)
 
-    def text_missing(self, goal_id: str, now: Now, *, missing: bool) -> None:
-        """Record whether the active goal is silent because the next part of its text is missing."""
+    def text_missing(self, goal_id: str, length: int, now: Now, *, missing: bool) -> None:
+        """Record whether the active goal is silent because the next part of its text is missing.
+
+        `length` is the number of characters that the engine has received.
+        """
         record = self._require_active(goal_id)
         record.waits = missing
         if missing:
-            record.spoken_end = record.begun_end
+            record.spoken_end, record.passed_chars = record.begun_end, length
         self._reset_stall_limit(record, now)
 
     def voice_chosen(self, goal_id: str, voice: str, now: Now) -> list[Effect]:
@@ -818,7 +823,7 @@ class Scheduler:
 
     def _reset_stall_limit(self, record: Record, now: Now) -> None:
         """Restart the time limit for more text if a goal waits for text. Otherwise, remove the limit."""
-        record.stalls_at = now.monotonic + record.say.stall if record.waits else inf
+        record.stalls_at = now.monotonic + record.say.stall if record.waits and record.more else inf
 
     def _require_active(self, goal_id: str) -> Record:
         """Return the active goal, or raise IllegalTransition if it has another id."""

@@ -61,11 +61,11 @@ require_fields(protocol.Speak, ENGINE_OPTIONS)
 
 
 def unheard_chars(record: Record) -> int:
-    """Return how many characters of a goal's text can be spoken, but have not been heard yet.
+    """Return how many characters of a goal's text have not been heard yet.
 
-    If a goal waits for text, the rest of its text can't be spoken yet, or contains no words, such as a block of code.
+    If a goal waits for text, all text that the engine has received doesn't count, such as a block of code.
     """
-    return 0 if record.waits else len(record.say.text) - record.begun_end
+    return len(record.say.text) - record.passed_chars
 
 
 def monotonic_now() -> float:
@@ -324,10 +324,11 @@ class Speech:
         scheduler = self.scheduler
         match event:
             case protocol.TextMissing():
-                scheduler.text_missing(event.id, now, missing=event.missing)
+                if active.waits is not event.missing:
+                    publish = partial(self.subscribers.text_missing, event.id, time.time(), waits=event.missing)
+                    self.notifications.add([publish])
+                scheduler.text_missing(event.id, event.length, now, missing=event.missing)
                 self._resume_appends(active)
-                publish = partial(self.subscribers.text_missing, event.id, time.time(), waits=event.missing)
-                self.notifications.add([publish])
                 self._set_timer()
             case protocol.Word():
                 scheduler.word_heard(event.id, event.start, event.end, event.time)

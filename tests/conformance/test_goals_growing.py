@@ -152,9 +152,12 @@ def test_the_reply_comes_when_enough_of_the_text_was_heard(talk: Talk) -> None:
     assert message["length"] == len(BEGINNING) + MAX_UNHEARD_CHARS
 
 
-def test_a_held_back_reply_comes_at_the_end_of_the_goal(talk: Talk) -> None:
+def test_a_reply_that_is_held_back_in_a_pause_comes_at_the_end_of_the_goal(talk: Talk) -> None:
     with talk.connect() as client, talk.connect() as other:
-        goal_id = begin(client, BEGINNING)
+        goal_id = begin(client, feedback=True)
+        client.receive_event("word")
+        client.receive_event("waits", waits=True)
+        assert other.request("pause")["ok"]
         for number in range(2):
             client.send({"seq": number, "request": "append", "id": goal_id, "text": "word " * 1_800})
         other.request("cancel", ids=[goal_id])

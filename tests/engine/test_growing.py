@@ -120,6 +120,14 @@ def test_a_goal_that_waits_for_text_can_be_stopped_and_paused(engine: Engine) ->
         engine.resume("g2")
         assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
         assert [word.number for word in engine.words("g2")] == [1, 2]
+        grow(engine, "One", "g3", end=False)
+        engine.until(protocol.TextMissing)
+        engine.pause("g3")
+        engine.send(protocol.Append("g3", ".", end=True))
+        engine.resume("g3")
+        event = engine.event()
+        assert isinstance(event, protocol.TextMissing), "text from a pause is spoken only after a sign of life"
+        engine.until(protocol.Ended)
 
 
 @pytest.mark.parametrize("whole", [False, True], ids=["appended", "sent again"])

@@ -168,7 +168,7 @@ class Engine:
         now, spans, words = time.monotonic(), goal.take_words(), goal.script
         if goal.text_missing != (missing := goal.more and not spans):
             goal.text_missing = missing
-            self._send(protocol.TextMissing(goal.id, missing))
+            self._send(protocol.TextMissing(goal.id, missing, len(goal.text)))
         if missing:
             return
         begin, length = goal.length, words.number("length", 0.1)

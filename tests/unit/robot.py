@@ -129,7 +129,7 @@ class Robot:
             case "stopped":
                 self.collect(self.scheduler.stopped(goal_id, self.now))
             case "starved" | "fed":
-                self.scheduler.text_missing(goal_id, self.now, missing=event == "starved")
+                self.scheduler.text_missing(goal_id, 1, self.now, missing=event == "starved")
             case _:
                 raise ValueError(event)
 

@@ -33,6 +33,10 @@ stalls after a pause
     a more stall=2; starved a; pause; wait 9; resume; wait 2; stopped a -> a ABORTED text_stalled
 has no limit while there is text to speak
     a more stall=2; starved a; fed a; wait 9 -> a ACTIVE
+has no limit once it is complete
+    a more stall=2; starved a; append a end; wait 9 -> a ACTIVE
+has no limit once it breaks off
+    a more stall=2; starved a; left a; wait 9 -> a ACTIVE
 has no limit before it is spoken
     a; b more stall=1; wait 9; completed a -> b ACTIVE; a SUCCEEDED
 makes room for the next goal

@@ -375,9 +375,10 @@ class Playback:
         self._text_was_missing = True
         if self._feed is not None:
             self._with_player(lambda feed: self._await_samples(feed, until=until))
-            return
-        self._wait_for_continue()
-        self._wait(until=until)
+        elif self._runner.hold_number:
+            self._wait_for_continue()
+        else:
+            self._wait(until=until)
 
     def finish(self) -> float:
         """Play the sentence to its end. Return its length in seconds.

@@ -47,6 +47,8 @@ DRIVER_LIMIT_S = 10.0
 #: Maximum number of words expected for each remaining character. "€" is spoken as one word. An emoji is spoken as up to
 #: five words, but a text rarely consists of emojis only.
 MAX_WORDS_PER_CHARACTER = 3
+#: How many characters must arrive before the server is told again that text is missing.
+REPORTED_CHARS = 1_000
 
 
 class Channel:
@@ -99,6 +101,8 @@ class ActiveGoal:
         #: the text, if it may still grow
         self.growing_text = _make_growing_text(self.text, command) if command.more or command.broken else None
         self.text_missing = False
+        #: number of characters received, and how many of them the server knows to be received
+        self.length, self.reported_length = len(command.text), 0
         self.words = WordFinder(self.text)
         #: time at which the driver last received text
         self.resumed_at = now
@@ -130,6 +134,7 @@ class ActiveGoal:
     def append(self, command: protocol.Append, now: float) -> None:
         """Add text to the goal, or mark its text as complete."""
         assert self.growing_text
+        self.length += len(command.text)
         text = self._remove_markdown(command.text, ended=command.end)
         self.growing_text.append(text, now)
         self.words.append(text)
@@ -310,12 +315,14 @@ class GoalRunner:
     def report_text_missing(self, missing: bool) -> None:
         """Tell the server whether the goal is silent because text is missing.
 
-        Do nothing if the server already knows.
+        Do nothing if the server already knows, unless a long text has arrived that can't be spoken yet.
         """
         goal = self._goal
-        if goal is not None and missing != goal.text_missing:
-            goal.text_missing = missing
-            self._channel.send(protocol.TextMissing(goal.id, missing))
+        if goal is None:
+            return
+        if missing != goal.text_missing or (missing and goal.length > goal.reported_length + REPORTED_CHARS):
+            goal.text_missing, goal.reported_length = missing, goal.length
+            self._channel.send(protocol.TextMissing(goal.id, missing, goal.length))
 
     def confirm_hold(self) -> None:
         """Confirm to the server that the paused goal is silent.
