@@ -446,7 +446,7 @@ class Client:
         return handle, accepted
 
     def _full_id(self, goal_id: str) -> str:
-        """Check a goal id. Return it, with the boot id in front if it is only a number.
+        """Check a goal id, and add the boot id if only a number is given. Return the full id.
 
         Raises the same errors as `check_id`.
         """

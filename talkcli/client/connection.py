@@ -41,7 +41,7 @@ _RECONNECT_PAUSE_S = 0.1
 
 
 def checked_sender_name(name: str | None) -> str | None:
-    """Return the given name, or else TALK_NAME, or else None. Raise UsageError if it is too long."""
+    """Return the given name, or else TALK_NAME, or else None. Raise UsageError if the name is too long."""
     name = sender_name(name)
     if name and len(name) > MAX_SENDER_NAME_CHARS:
         raise UsageError(f"the sender's name is too long: {len(name)} characters (at most {MAX_SENDER_NAME_CHARS})")

@@ -119,7 +119,7 @@ class EventListeners:
         self.watches: WeakSet[EventBuffer] = WeakSet()
 
     def add(self, tracked: TrackedGoal) -> None:
-        """Start to pass a goal's events and all pauses to `tracked`.
+        """From now on, pass a goal's events and all pauses to `tracked`.
 
         This ends when the goal has ended or is lost.
         """
@@ -188,7 +188,7 @@ class TrackedGoal:
     def __init__(self, goal: Goal) -> None:
         #: the goal's last known state
         self.goal = goal
-        #: whether a goal with this id had already been sent, so that the text isn't spoken twice
+        #: whether a goal with this id had already been sent. In this case, the text isn't spoken again.
         self.attached = False
         #: whether all speech is paused, as far as the client knows
         self.speech_paused = False
@@ -286,7 +286,7 @@ class TrackedGoal:
 
 @frozen
 class ServerInfo:
-    """A server's description of itself, from its greeting or its robot's presence."""
+    """A server's description of itself, as sent in its greeting or published by its robot."""
 
     boot: str = ""
     pid: int | None = None
@@ -413,7 +413,7 @@ class ClientCore:
 
     @property
     def boot(self) -> str:
-        """The server's boot id, with which its goal ids begin."""
+        """The server's boot id, which is the first part of its goal ids."""
         return self.server.boot
 
     @property
@@ -502,7 +502,7 @@ class ClientCore:
             self.fail(exchange, self.unanswered(exchange))
 
     def answer(self, exchange: Exchange) -> tuple[JsonObject, list[JsonObject]]:
-        """Return the reply to a request and the items of its list. Raise the error if it failed.
+        """Return the reply to a request and the items of its list. Raise the error if the request failed.
 
         Raises:
             RequestRefused: the server refused the request.

@@ -138,7 +138,7 @@ class GoalHandle(TrackedGoal):
         if self.id and (not self.state.terminal or self.state is State.LOST):
             failures: list[TalkError] = []
             self._connection.submit(Cancel((self.id,)), lambda *_: None, failures.append)
-            # If the connection has broken instead, the buffer is empty.
+            # If the buffer is empty, the connection has broken, which is not an error here.
             if failures and self._connection.unsent_bytes:
                 raise failures[0]
 
@@ -168,7 +168,7 @@ class GoalHandle(TrackedGoal):
         self._listen_to(self._connection.listeners, feedback=feedback, now=time.monotonic())
 
     def _iterate_events(self, end: float | None, timeout: float | None) -> Iterator[Event]:
-        """Yield the goal's events up to its Result. Raise TimeoutError at the monotonic time `end`."""
+        """Yield the goal's events up to the Result. Raise TimeoutError if `end` (monotonic) passes first."""
         for event in take_repeatedly(self._connection, self._take, end):
             if event is None:
                 self._give_up(timeout)

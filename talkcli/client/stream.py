@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from talkcli.client.connection import Connection
     from talkcli.goals.goal import JsonObject
 
-#: How many times an addition is sent again. The limit matters if the request itself breaks the connection.
+#: How many times an addition to a text is sent again. The limit matters if the request itself breaks the connection.
 _MAX_RESENDS = 5
 
 
@@ -126,7 +126,7 @@ class SpeechStream:
         return handle
 
     def _add_text(self, *_: object) -> None:
-        """Add the text that the server has accepted to the handle's goal."""
+        """Add the text that the server has accepted to the goal's handle."""
         assert self.goal
         addition = self._text.accepted(self.goal.id)
         assert isinstance(addition, Append)
@@ -139,7 +139,7 @@ class SpeechStream:
             self._connection.request(Append(self.goal.id, broken=True))
 
     def _process_error(self, error: TalkError) -> None:
-        """Record that the goal takes no more text, unless the error only concerns the last text.
+        """Record that the goal takes no more text. If the error only concerns the last text, raise it instead.
 
         Raises:
             RequestRefused: the error only concerns the last text.

@@ -89,7 +89,7 @@ class SpeechTimes:
         self._starts: OrderedDict[str | bytes, tuple[float, str]] = OrderedDict()
 
     def add(self, record: Record) -> None:
-        """Record when a goal started, under its key and its text.
+        """Record when a goal started, for its key and for its text.
 
         The goal must have been heard, at least in part.
         """

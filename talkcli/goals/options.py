@@ -76,7 +76,7 @@ def is_neural(voice: str) -> bool:
 
 @frozen
 class Kind:
-    """The type of an option's values, with its name and its error message."""
+    """A type of values that an option can have, such as numbers of seconds."""
 
     #: name of the type in the protocol's document
     name: str
@@ -155,7 +155,7 @@ IDS = Kind("list", (list, tuple), f"must be a list of at most {MAX_IDS} ids", "[
 
 @frozen
 class Setting:
-    """The server's default value for a goal option, with its documentation and flags."""
+    """A setting of the server, which is the default value of a goal option."""
 
     initial: Any
     #: value that means "none" and is shown as null
@@ -176,7 +176,7 @@ class Setting:
 
 @frozen
 class Option:
-    """An option of a goal or a command, with its allowed values and its documentation."""
+    """An option of a goal or a command: its allowed values, its flags and its documentation."""
 
     name: str
     kind: Kind
@@ -711,7 +711,7 @@ def bad_option(request: Say | Set) -> str | None:
 
 
 def bad_text(text: str, max_chars: int | None = MAX_TEXT_CHARS) -> Refusal | None:
-    """Return the reason and a message if a text obviously can't be spoken. Otherwise, return None.
+    """Return a reason and a message if a text obviously can't be spoken. Otherwise, return None.
 
     Args:
         text: the text.
@@ -734,7 +734,7 @@ def is_visible(text: str) -> bool:
 
 
 def bad_characters(text: str, max_chars: int | None, before_chars: int = 0) -> Refusal | None:
-    """Return the reason and a message if a text is too long or has a forbidden character, or else None.
+    """Return a reason and a message if a text is too long or has forbidden characters. Otherwise, return None.
 
     Args:
         text: the text.
@@ -769,12 +769,12 @@ def engine_options(say: Say, settings: Set) -> dict[str, Any]:
 
 
 def shown_settings(settings: Set) -> JsonObject:
-    """Return settings for display, with None for the default voice and for no time limit."""
+    """Return the settings for display. None stands for the default voice or no time limit."""
     return _replace_none_values(fields(settings))
 
 
 def _replace_none_values(values: dict[str, Any]) -> dict[str, Any]:
-    """Return a copy of the settings, with None for each value that means "none"."""
+    """Return a copy of the settings in which values that mean "none" are None."""
     return {name: None if value == _NONE_VALUES.get(name) else value for name, value in values.items()}
 
 

@@ -435,8 +435,9 @@ class Scheduler:
         """
         record = self._require_active(goal_id)
         if start >= record.begun_end:
-            between = record.say.text[record.begun_end : start]  # may have a word that was spoken with the last one
-            opening = [] if between[-1:].isspace() else between.split()[-1:]  # a quotation mark before the new word
+            # This text may contain a word that is spoken together with the word before it.
+            between = record.say.text[record.begun_end : start]
+            opening = [] if between[-1:].isspace() else between.split()[-1:]  # such as a quotation mark
             record.spoken_end = record.begun_end + len(between.removesuffix("".join(opening)).rstrip())
         record.begun_end = max(record.begun_end, end)
         record.passed_chars = max(record.passed_chars, end)
@@ -655,7 +656,7 @@ class Scheduler:
         return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)
 
     def _find_room(self, say: Say) -> list[tuple[Record, Reason]] | None:
-        """Return the goals to remove for a new goal, with the reasons. Return None if there is no room."""
+        """Return the goals to remove for a new goal and the reasons, or None if there is no room."""
         replaced = self.pending.with_key(say.key)
         preempted: list[Record] = []
         if say.flush:

@@ -109,7 +109,7 @@ class StateChanged:
 
 @frozen
 class WordHeard:
-    """Event sent when a word begins to be heard."""
+    """Event sent when a word can be heard."""
 
     id: str
     word: str
@@ -247,7 +247,7 @@ def _event_json(kind: str, event: StateChanged | WordHeard | TextAdded | TextMis
 
 
 def goals(items: list[JsonObject], name: str) -> Iterator[Goal]:
-    """Yield the goals in the list items that have this field. Raise Unreadable if one is malformed."""
+    """Yield the goal in this field of each list item, if any. Raise Unreadable if one is malformed."""
     return (Goal.from_json(each[name]) for each in items if name in each)
 
 
@@ -296,7 +296,7 @@ def check_greeting(message: JsonObject) -> None:
 
 
 def item(seq: int | None, **fields: object) -> JsonObject:
-    """Return the message for one list item of the answer to request `seq`.
+    """Return the message for a list item that belongs to the request `seq`.
 
     List items are sent before the reply.
     """

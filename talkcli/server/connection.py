@@ -169,7 +169,7 @@ class PendingRequest:
             self.move_to(self._steps.send(in_time))
 
     def _leave(self) -> bool:
-        """Remove the request from its waiting list. Return False if it is in none."""
+        """Remove the request from its waiting list. Return False if it isn't in one."""
         if self.waiting_list is None:
             return False
         del self.waiting_list[self]

@@ -256,7 +256,7 @@ class Requests:
         speech.apply(effects)
 
     async def _append(self, pending: PendingRequest, request: Append) -> None:
-        """Add text to a goal, and reply when little of the text is still unheard."""
+        """Add text to a goal. Delay the reply while too much of the text has not been heard."""
         speech, now = self._speech, self._speech.advance_time()
         record = self._require_goal(request.id)
         length = len(record.say.text)
@@ -277,7 +277,7 @@ class Requests:
         pending.answer(length=len(record.say.text), state=record.state.name)
 
     def _require_producer(self, record: Record, connection: ClientConnection) -> None:
-        """Let a connection add text to a goal. Raise RequestRefused if another connection does.
+        """Let a connection add text to a goal. Raise RequestRefused if another one already does.
 
         A new connection may continue a text if the old one is gone and the sender chose the goal's id.
         """

@@ -183,9 +183,9 @@ class Server:
             raise self._fatal_error
 
     def _apply_configured_voice(self) -> str | None:
-        """Apply the configured voice if it is neural. Otherwise, return it, if any.
+        """Use the configured voice if it is neural. Otherwise, return it, because the engine must check it.
 
-        The engine must check a voice that is returned. A neural voice is loaded later, so that it doesn't delay speech.
+        A neural voice is loaded later, so that it doesn't delay speech.
 
         Raises:
             UsageError: if a neural voice is unknown.

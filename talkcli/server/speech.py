@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from talkcli.goals.scheduler import Scheduler
     from talkcli.server.connection import ClientConnection, WaitingList
 
-#: A clock that keeps running while the machine is suspended. On Linux, the usual monotonic clock stops.
+#: A clock that keeps running while the machine is suspended. On Linux, the usual monotonic clock stops then.
 _CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 #: How often to check whether the deadline has passed. The event loop's own timers stop while the machine is suspended.
 CLOCK_CHECK_S = 1.0
@@ -159,7 +159,7 @@ class Speech:
             yield each.connection
 
     def _resume_appends(self, record: Record) -> None:
-        """Resume the waiting `append` requests of a goal if little of its text is still unheard."""
+        """Resume a goal's waiting `append` requests if enough of its text has been heard."""
         waiting = self._waiting_for_hearing.get(record)
         if waiting and unheard_chars(record) <= MAX_UNHEARD_CHARS:
             resume_all(waiting)

@@ -1,4 +1,4 @@
-"""Accepts, reads and writes the sockets of clients, all in the event loop's thread.
+"""Accepts clients' connections, and reads and writes their sockets, in the event loop's thread.
 
 Streams replace asyncio's transports and have a similar interface. There are three reasons for this:
 

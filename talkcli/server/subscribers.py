@@ -124,7 +124,7 @@ class Subscribers:
         _publish(event.to_json(), self._feedback_receivers([self._waiters.get(goal_id, {})]))
 
     def paused_changed(self, goal_id: str | None, *, paused: bool, by: By, at: float) -> None:
-        """Tell clients that want feedback that speech was paused or resumed.
+        """Send a pause or resume event to the clients that want feedback.
 
         `goal_id` is the id of the affected goal, if any.
         """
