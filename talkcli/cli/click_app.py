@@ -291,7 +291,7 @@ def _first_screen(context: click.Context) -> str:
 
 
 def run(arguments: list[str]) -> int:
-    """Run a command line, or print its completions, and return the exit code."""
+    """Run a command line or print its completions. Return the exit code."""
     options = CommonOptions()
     if "_TALK_COMPLETE" in os.environ:
         from talkcli.cli import completion

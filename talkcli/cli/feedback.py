@@ -136,7 +136,7 @@ class _TerminalFeedback(Feedback):
         self._paint()
 
     def close(self) -> None:
-        """Finish the current line, and stop watching for terminal resizes."""
+        """Finish the current line, and stop watching the terminal's size."""
         self._resizes.close()
         if self._line:
             self._write_whole(self._line)

@@ -103,7 +103,7 @@ class Interrupts:
         return kind is Interrupted
 
     def handle_error(self, error: Interrupted | OSError) -> None:
-        """Record whether the output's reader is gone. Raise the error again if it is unrelated.
+        """After an interrupt or an output error, record whether the output's reader is gone. Raise any other error.
 
         If the reader is gone, discard all output. Errors are unrelated if they are neither an interrupt nor a timeout.
         """

@@ -297,7 +297,8 @@ class LineSpeaker(InputSpeaker):
                 try:
                     self._step()
                 except TalkError as error:
-                    if time.monotonic() >= self._end:  # a robot's connection has the same limit, and reports it as lost
+                    # A robot's connection has the same time limit, and raises Lost when the limit is reached.
+                    if time.monotonic() >= self._end:
                         raise TimeoutError from error
                     if self._error is not None:
                         raise
@@ -326,7 +327,7 @@ class LineSpeaker(InputSpeaker):
 
     @property
     def _has_lines(self) -> bool:
-        """Whether more lines may have to be sent."""
+        """Whether there may be more lines to send."""
         return self._buffer.first is not None or not self._buffer.ended
 
     @property

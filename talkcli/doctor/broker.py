@@ -380,7 +380,7 @@ def judge_login(broker: Broker, refusal: str | None) -> Finding:
 
 
 def judge_presence(presence: Presence, now: float) -> Finding:
-    """Return the finding about whether a robot and its server are online."""
+    """Return the finding on whether a robot and its server are online."""
     robot = presence.name
     if not presence.online:
         step = f"check its network and power; on {robot}, run: systemctl status talk-bridge"

@@ -121,7 +121,7 @@ def _cancel_late_goal(client: Client, goal: GoalHandle, limit: float) -> Sentenc
     """Cancel a goal that took too long, and return a result that explains the delay."""
     before = client.status()
     ended = goal.cancel()
-    if ended.state in {State.SUCCEEDED, State.ABORTED}:  # it ended before it could be cancelled
+    if ended.state in {State.SUCCEEDED, State.ABORTED}:  # the goal ended before it could be cancelled
         return _convert_ended_goal(ended)
     pending = [each.id for each in before.pending]
     if before.server.get("paused") is True:
@@ -142,7 +142,7 @@ def _convert_ended_goal(goal: Goal) -> SentenceResult:
 
 
 def speak_beside_server(client: Client, options: EngineOptions, limit: float) -> SentenceResult:
-    """Speak a silent sentence. Return its result, which shows if the server spoke at the same time.
+    """Speak a sentence at zero volume. Return its result, which shows if the server spoke at the same time.
 
     The doctor's own engine speaks the sentence.
     """

@@ -268,7 +268,7 @@ def run_program(program: str, *arguments: str, env: Mapping[str, str], limit: fl
         code = process.returncode
         if code is None:
             kill([-process.pid])  # the group's id stays valid until the process is reaped
-            with contextlib.suppress(subprocess.TimeoutExpired):  # it hangs in a driver, so init will reap it
+            with contextlib.suppress(subprocess.TimeoutExpired):  # the program hangs in a driver, so init will reap it
                 process.wait(1)
         stdout, stderr = (os.pread(each.fileno(), _MAX_OUTPUT_BYTES, 0).decode(errors="replace") for each in (out, err))
     if code is None:
@@ -380,7 +380,9 @@ def _find_pulse_address(env: Mapping[str, str]) -> str | None:
 
 
 def check_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[str], *, in_use: bool) -> list[Finding]:
-    """Return findings about the volume of the sound server's output or, without a sound server, of the cards.
+    """Return findings about the volume of the sound server's output, or of the sound cards.
+
+    The sound cards are only checked if there is no sound server.
 
     Args:
         env: the environment of the player.
@@ -543,7 +545,7 @@ def check_device(env: Mapping[str, str], player: str, configured: str | None) ->
 
 
 def check_cards(cards: Sequence[str], sound_server: SoundServer, session: UserSession) -> Finding:
-    """Return the finding about whether the kernel has found any sound cards."""
+    """Return the finding on whether the kernel has found any sound cards."""
     if cards:
         return ok("cards", join_names(cards))
     if sound_server.name is not None:

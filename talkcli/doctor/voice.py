@@ -249,7 +249,7 @@ def _check_voice_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
 
 
 def _find_package_fault(env: Mapping[str, str]) -> tuple[str, str] | None:
-    """Return why a package for neural voices can't be imported, and advice. Return None if all can be imported."""
+    """Return why a package for neural voices can't be imported, and advice. Return None if nothing is wrong."""
     missing = models.missing_package()
     if missing is not None:
         return _split_advice(missing)

@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 PRESENCE_EXPIRY_S, PRESENCE_EVERY_S = 150, 60.0
 #: Time allowed for another bridge with the same robot name to answer.
 _RIVAL_LIMIT_S = 1.0
-#: Maximum random pause before the first and before later attempts to reconnect to the broker. Without randomness, a
-#: thousand robots would reconnect at the same moment.
+#: Maximum random pause before the first attempt to reconnect to the broker, and before later ones. Without randomness,
+#: a thousand robots would reconnect at the same moment.
 _FIRST_BROKER_RETRY_S, _LAST_BROKER_RETRY_S = 0.5, 10.0
 #: If no echo returns for this long, the bridge closes its connection to the broker.
 _ECHO_TIMEOUT_S = 15.0
@@ -431,7 +431,7 @@ class Bridge:
     # -- what this bridge publishes about itself
 
     def _publish_presence(self) -> None:
-        """Publish a retained message that shows that the robot is online and describes its server."""
+        """Publish a retained message that reports the robot as online and describes its server."""
         self._presence_at = self._loop.time()
         presence = replace(self._presence, server=self._publisher.server).to_json()
         line = encode({"talk": PROTOCOL, "version": __version__, **presence})

@@ -35,14 +35,14 @@ ALLOWABLE_REQUESTS = tuple(each for each in REQUEST_TYPES if each not in (*ALWAY
 ECHO_EVERY_S = 5.0
 #: A message is stale if the newest returned echo is older than this. The extra second is for transmission.
 STALE_AFTER_S = ECHO_EVERY_S + 1.0
-#: Maximum number of pending goals from remote clients. The server's queue has 100 places by default. The rest are left
-#: to local clients.
+#: Maximum number of pending goals from remote clients. The server's queue has 100 places by default. The others
+#: are left to local clients.
 MAX_REMOTE_GOALS = 20
 #: How many goal ids to remember, so that no goal is spoken twice, even if the server has forgotten it.
 MAX_REMEMBERED_IDS = 1_000
 #: Maximum size of the correlation data, which is repeated in the header of each answer.
 MAX_CORRELATION_BYTES = 256
-#: Fields of a goal that may contain its text. The message may quote it.
+#: Fields of a goal that may contain its text. The field `message` may quote the text.
 PRIVATE_FIELDS = ("text", "spoken", "message")
 #: TTL of a goal whose message expired while the goal was waiting for room. Zero would mean no limit.
 _EXPIRED_TTL_S = 0.001

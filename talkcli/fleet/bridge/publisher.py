@@ -52,7 +52,7 @@ _STATUS_EVERY_S = 1.0
 _STATUS_AFTER_CHANGE_S = 0.1
 #: Maximum length of a goal's text in the status. Longer texts are cut off.
 _MAX_STATUS_TEXT_CHARS = 1_000
-#: Maximum random pause before the first and before later attempts to reconnect to the server.
+#: Maximum random pause before the first attempt to reconnect to the server, and before later ones.
 _FIRST_SERVER_RETRY_S, _LAST_SERVER_RETRY_S = 0.2, 5.0
 
 

@@ -184,7 +184,7 @@ class RemoteSessions:
             request, say, session = self.waiting.pop(0)
             session.send_say(request, say, has_room=True)
 
-    # -- from the watch of the server
+    # -- from the publisher
 
     def handle_goal_change(self, event: StateChanged, boot: str) -> None:
         """Update the pending goals after the server with this boot id has reported a state change."""

@@ -230,7 +230,7 @@ class FleetRequest:
                 self._on_presence(robot, robot.presence)
 
     def _on_refused(self, error: TalkError) -> None:
-        """Store the error of a rejected message to the group, which `results` raises."""
+        """Store the error if a message to the group was rejected. `results` raises this error."""
         self._refused = error
 
     def _check_for_late_robots(self) -> None:
