@@ -45,14 +45,15 @@ class InputDecoder:
         Empty bytes mark the end of the input.
         """
         added = self._decoder.decode(data, final=not data)
-        text = self._text + self._line_breaks + added
         if not added.isprintable() and any(map(is_bad_byte, added)):
-            text, problem = replace_bad_bytes(text)
-            self.problem = self.problem or problem
-        end = len(text.rstrip("\r\n"))
-        if data and len(text) - end > _MAX_HELD_LINE_BREAKS:
-            end = len(text)
-        added, self._line_breaks = text[len(self._text) : end], text[end:]
+            if self.problem is None:
+                self.problem = replace_bad_bytes(self._text + self._line_breaks + added)[1]
+            added, _ = replace_bad_bytes(added)
+        found = self._line_breaks + added
+        end = len(found.rstrip("\r\n"))
+        if data and len(found) - end > _MAX_HELD_LINE_BREAKS:
+            end = len(found)
+        added, self._line_breaks = found[:end], found[end:]
         self._text += added
         return added
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from bisect import bisect_right
 from itertools import accumulate
 
 from talkcli.frozen import TYPE_CHECKING, frozen
@@ -267,12 +268,12 @@ class MeasuredText:
         if column <= 0:
             return 0
         # The ellipsis needs one more column. The first visible character must not be a combining mark.
-        begins = (place for place in range(max_index) if column < self._columns[place] < self._columns[place + 1])
-        return next(begins, max_index)
+        places = range(bisect_right(self._columns, column), max_index)
+        return next((place for place in places if self._columns[place] < self._columns[place + 1]), max_index)
 
     def _count_fitting(self, columns: int) -> int:
         """Return how many characters at the start of the text fit into `columns`."""
-        return sum(each <= columns for each in self._columns) - 1
+        return bisect_right(self._columns, columns) - 1
 
 
 def _is_hidden(character: str) -> bool:
