@@ -214,6 +214,21 @@ def test_a_process_that_accepts_no_goal_is_replaced(start: StartThread, monkeypa
     assert thread.until(protocol.Ended) == SPOKEN
 
 
+def test_a_process_that_reads_late_gets_all_of_a_growing_text(start_python: Callable[..., EngineThread]) -> None:
+    count = 'seen = globals().setdefault("seen", []); seen.append(command.text)'
+    reply = 'protocol.Ended(command.id, protocol.OUTCOME_COMPLETED, None, str(len("".join(seen))))'
+    thread = start_python("send(protocol.Started(command.id))", f"{count}; command.end and send({reply})")
+    process, sent = _process(thread), threading.Event()
+    thread.engine.speak(protocol.Speak("g1", "a", 200, 1.0, None, 50, more=True))
+    os.kill(process.pid, signal.SIGSTOP)
+    for length in range(2, 5_001):
+        thread.engine.append("g1", "a" * length, complete=length == 5_000, broke_off=False)
+    thread.engine._actions.call(sent.set)
+    assert sent.wait(PATIENCE)
+    os.kill(process.pid, signal.SIGCONT)
+    assert thread.until(protocol.Ended).message == "4999"
+
+
 def test_a_goal_sent_to_a_dying_process_is_spoken_by_the_next(start: StartThread) -> None:
     thread = start()
     thread.until(protocol.Ready)

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
 #: Environment variables that systemd sets only for the server itself.
 _SERVER_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID", "LISTEN_FDS", "LISTEN_PID", "LISTEN_FDNAMES")
-#: Size of the socket's send buffer. The longest text fits into it several times, even if many characters are escaped.
-_SEND_BUFFER_BYTES = 512 * 1024
 #: Time allowed for a process to exit on its own after it has closed its connection. Killing it earlier would hide its
 #: exit status.
 _EXIT_WAIT_S = 0.2
@@ -72,6 +70,8 @@ class EngineProcess:
         self.ready = False
         #: whether the process has sent an event about a goal; set by the supervisor
         self.had_goal = False
+        #: commands, or parts of them, for which the socket had no room
+        self._unsent = bytearray()
         self._lines = LineSplitter()
         self._stderr_lines = LineSplitter(MAX_STDERR_LINE_BYTES)
         self._last_stderr_line = ""
@@ -86,7 +86,6 @@ class EngineProcess:
             handed_over.callback(close, liveness, stderr)
             os.set_blocking(self.stderr, False)
             self.socket.setblocking(False)
-            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
             self._process: subprocess.Popen[bytes] = subprocess.Popen(
                 engine_command(),
                 stdin=theirs.fileno(),
@@ -103,18 +102,32 @@ class EngineProcess:
         self.send(configure)
 
     def send(self, command: protocol.Command) -> bool:
-        """Send a command without blocking. Return whether it was sent."""
-        line = protocol.encode(command)
+        """Send a command, or keep it until the process reads earlier ones. Return False if the process is dead."""
+        self._unsent += protocol.encode(command)
+        return self._flush()
+
+    def _flush(self) -> bool:
+        """Send as much of the waiting commands as possible. Return False if the process is dead."""
         try:
-            return self.socket.send(line) == len(line)
-        except OSError:  # the process is dead, the buffer is full, or memory is short
+            while self._unsent:
+                del self._unsent[: self.socket.send(self._unsent)]
+        except BlockingIOError:
+            return True
+        except OSError:  # the process is dead, or memory is short
             return False
+        return True
+
+    @property
+    def socket_events(self) -> int:
+        """The poll events after which `receive` must be called."""
+        return select.POLLIN | (select.POLLOUT if self._unsent else 0)
 
     def receive(self) -> Iterator[protocol.Event | None]:
-        """Yield the events that have arrived, without blocking.
+        """Send waiting commands, and yield the events that have arrived, without blocking.
 
         The last one is None if the connection has ended. A malformed message counts as the end of the connection.
         """
+        self._flush()
         try:
             data = self.socket.recv(65536)
         except BlockingIOError:
@@ -260,8 +273,9 @@ class PrivateEngine(contextlib.AbstractContextManager["PrivateEngine"]):
     def _receive_events(self) -> Iterator[protocol.Event]:
         """Yield the events of the process. Raise an error if the process fails or takes too long."""
         process = self._process
-        watched = {process.socket.fileno(): select.POLLIN, process.stderr: select.POLLIN}
+        watched = {process.stderr: select.POLLIN}
         while True:
+            watched[process.socket.fileno()] = process.socket_events
             limit = HANG_LIMIT_S if process.ready else START_LIMIT_S
             due = min(self._last_event_at + limit, self._deadline)
             ready = wait_ready(watched, due - time.monotonic(), self._interrupt)

@@ -306,6 +306,8 @@ class Supervisor:
     def _wait_and_handle(self, until: float) -> None:
         """Wait for messages and actions until a deadline, and handle them."""
         watched = dict.fromkeys([self._actions.fileno(), *self._watched], select.POLLIN)
+        if self._process:
+            watched[self._process.socket.fileno()] = self._process.socket_events
         ready = wait_ready(watched, until - time.monotonic())
         self._actions.run()
         for descriptor in ready:
