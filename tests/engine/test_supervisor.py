@@ -205,15 +205,6 @@ def test_the_process_learns_whether_another_goal_waits(start_python: Callable[..
     assert thread.until(protocol.Ended) == protocol.Ended("g1", OUTCOME_COMPLETED, None, f"{waits} True")
 
 
-def test_a_process_that_accepts_no_goal_is_replaced(start: StartThread, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The next process gets the goal."""
-    thread = start()
-    monkeypatch.setattr(_process(thread), "send", lambda _: False)
-    thread.say("yes")
-    assert thread.until(EngineDied).message == "the engine does not accept commands"
-    assert thread.until(protocol.Ended) == SPOKEN
-
-
 def test_a_process_that_reads_late_gets_all_of_a_growing_text(start_python: Callable[..., EngineThread]) -> None:
     count = 'seen = globals().setdefault("seen", []); seen.append(command.text)'
     reply = 'protocol.Ended(command.id, protocol.OUTCOME_COMPLETED, None, str(len("".join(seen))))'
@@ -266,13 +257,6 @@ def test_abandoning_a_goal_that_has_ended_keeps_the_process(start: StartThread) 
     for number in (2, 3):
         assert thread.spoken("yes", f"g{number}").id == f"g{number}"
     assert thread.engine._process is process
-
-
-def test_a_closed_process_accepts_no_command(start: StartThread) -> None:
-    thread = start()
-    process = _process(thread)
-    thread.close()
-    assert not process.send(protocol.Stop("g1"))
 
 
 def test_a_goal_submitted_just_before_the_shutdown_ends(start: StartThread, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -101,21 +101,16 @@ class EngineProcess:
         self.pid = self._process.pid
         self.send(configure)
 
-    def send(self, command: protocol.Command) -> bool:
-        """Send a command, or keep it until the process reads earlier ones. Return False if the process is dead."""
+    def send(self, command: protocol.Command) -> None:
+        """Send a command, or keep it until the process has read earlier ones."""
         self._unsent += protocol.encode(command)
-        return self._flush()
+        self._flush()
 
-    def _flush(self) -> bool:
-        """Send as much of the waiting commands as possible. Return False if the process is dead."""
-        try:
+    def _flush(self) -> None:
+        """Send as much of the waiting commands as possible, without blocking."""
+        with contextlib.suppress(OSError):  # the buffer is full, the process is dead, or memory is short
             while self._unsent:
                 del self._unsent[: self.socket.send(self._unsent)]
-        except BlockingIOError:
-            return True
-        except OSError:  # the process is dead, or memory is short
-            return False
-        return True
 
     @property
     def socket_events(self) -> int:

@@ -251,11 +251,10 @@ class Supervisor:
     def announce_next(self, goal_id: str, next_waits: bool, next_is_neural: bool) -> None:
         """Tell the process whether another goal is waiting after the current one.
 
-        If so, the process shortens the silence between the two. A message that can't be sent is dropped, because it
-        isn't important.
+        If so, the process shortens the silence between the two.
         """
         command = protocol.NextGoal(goal_id, next_waits, next_is_neural)
-        self._actions.call(lambda: self._process and self._process.send(command))
+        self._actions.call(lambda: self._send(command))
 
     def load(self, voice: str) -> None:
         """Load a neural voice if an engine process is ready.
@@ -390,19 +389,11 @@ class Supervisor:
             self._loading, self._last_sign_at = voice, time.monotonic()
 
     def _send(self, command: protocol.Command) -> bool:
-        """Send a command to the process if it is ready. Return whether it was sent.
-
-        A process that doesn't accept commands is killed.
-        """
-        process = self._process
-        if process is None or not process.ready:
+        """Send a command to the process if it is ready. Return whether it is ready."""
+        if self._process is None or not self._process.ready:
             return False
-        if process.send(command):
-            return True
-        self._receive(process)  # if the process is dead, this reports a crash instead
-        if process is self._process:
-            self._lose_process("the engine does not accept commands", Reason.ENGINE_HUNG)
-        return False
+        self._process.send(command)
+        return True
 
     def _append_text(self, goal_id: str, text: str, *, complete: bool, broke_off: bool) -> None:
         """Store the goal's longer text, and send the new part to the process.
