@@ -17,7 +17,8 @@ from talkcli.client.client import Client
 from talkcli.engine.protocol import Voice
 from talkcli.engine.voices import find_voice
 from talkcli.install import NEURAL_PACKAGES
-from tests.conformance.bareserve import LIMIT, SERVE, TALK, environment, run, serving
+from tests.conformance.bareserve import LIMIT, SERVE, TALK, Ended, environment, serving
+from tests.conformance.bareserve import run as run_program
 from tests.engine.test_neural import SLOW_TO_SPEAK, WITHOUT
 from tests.support import tiny_voice
 from tests.support.processes import children
@@ -25,7 +26,7 @@ from tests.support.surroundings import needs, needs_packages
 from tests.test_completion import offered
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
     from typing import Any
 
@@ -85,6 +86,18 @@ def hold(tmp_path: Path) -> Path:
     return tmp_path / "hold"
 
 
+def run(command: Sequence[str], env: dict[str, str]) -> Ended:
+    """Run a server or a client. A client doesn't need the code in `SITE`, so it can be forked."""
+    return run_program(
+        command, {name: value for name, value in env.items() if name != "PYTHONPATH" or "serve" in command}
+    )
+
+
+def _to_file(env: dict[str, str]) -> tuple[str, ...]:
+    """Return options for a server that speaks to a file, which is faster than real time."""
+    return ("--rate", "450", "--player", f"file:{env['HOME']}/said.wav")
+
+
 class Robot:
     """A server with neural voices, and its client."""
 
@@ -131,7 +144,7 @@ class Robot:
 
 @contextlib.contextmanager
 def _robot(env: dict[str, str], *options: str) -> Iterator[Robot]:
-    with serving(env, "--rate", "450", *options) as server:
+    with serving(env, *_to_file(env), *options) as server:
         robot = Robot(server, env)
         with robot.client:
             yield robot
@@ -185,7 +198,7 @@ def test_espeak_speaks_urgent_goals_while_their_voice_is_loading(env: dict[str, 
 def test_the_first_voice_is_loaded_in_silence_and_others_during_speech(env: dict[str, str], tmp_path: Path) -> None:
     """Loading the libraries for the first voice stops the process for an audible moment."""
     tiny_voice.put(tmp_path / "voices", "second")
-    with _robot(env) as robot:
+    with _robot(env, "--player", "null") as robot:
         active = robot.say(LONG, None)
         robot.until(lambda: robot.state(active) == "ACTIVE")
         goal = robot.say(voice="piper/second")
@@ -243,7 +256,7 @@ def test_two_voices_that_exceed_the_memory_limit_speak_in_turn(env: dict[str, st
 def test_a_voice_unloaded_while_speaking_is_not_counted_twice(env: dict[str, str], tmp_path: Path) -> None:
     tiny_voice.put(tmp_path / "voices", "second")
     env["BALLAST_BYTES"] = "100000000"
-    with _robot(env, "--voice-memory", "180") as robot:
+    with _robot(env, "--voice-memory", "180", "--player", "null") as robot:
         first = robot.say("this goes on and on " * 2)
         robot.until(lambda: robot.client.goal(first.id).spoken)
         second = robot.say(voice="piper/second")
@@ -276,7 +289,7 @@ def test_a_pitch_is_refused_with_a_voice_of_fixed_pitch(env: dict[str, str]) -> 
 
 
 def test_an_engine_crash_costs_one_goal_and_the_voice_is_loaded_again(env: dict[str, str]) -> None:
-    with _robot(env, "--voice", TINY) as robot:
+    with _robot(env, "--voice", TINY, "--player", "null") as robot:
         robot.until_loaded()
         goal = robot.say(LONG, None)
         robot.until(lambda: robot.client.goal(goal.id).spoken)
@@ -355,7 +368,7 @@ def test_gaps_on_a_slow_machine_are_reported(env: dict[str, str], tmp_path: Path
 
 
 def test_a_voice_installed_later_can_be_listed_and_used(env: dict[str, str], tmp_path: Path) -> None:
-    with serving(env, "--rate", "450"):
+    with serving(env, *_to_file(env)):
         listed = run([*TALK, "voices"], env).out
         assert "piper/tiny" in listed
         for command, code in ((["say", "--voice", "piper/late", "a"], 5), (["set", "--voice", "piper/late"], 2)):
@@ -478,7 +491,7 @@ def heard(env: dict[str, str], *options: str) -> object:
 
 def test_a_drivers_voice_precedes_a_neural_voice_of_the_same_name(env: dict[str, str], tmp_path: Path) -> None:
     tiny_voice.put(tmp_path / "voices", "en")
-    with serving(env, "--rate", "450", "--voice", "en"):
+    with serving(env, *_to_file(env), "--voice", "en"):
         assert heard(env) == "gmw/en"
         assert run([*TALK, "set", "--voice", "tiny"], env).code == 0
         used = [heard(env, "--voice-only", "--voice", voice) for voice in ("en-us", "EN", "gmw/en-US")]
@@ -488,7 +501,7 @@ def test_a_drivers_voice_precedes_a_neural_voice_of_the_same_name(env: dict[str,
 def test_an_unknown_voice_or_speaker_is_refused(env: dict[str, str], tmp_path: Path) -> None:
     several = tiny_voice.description(speakers=2)
     tiny_voice.put(tmp_path / "voices", "two", tiny_voice.model(speakers=2), several)
-    with serving(env, "--rate", "450"):
+    with serving(env, *_to_file(env)):
         for voice, message in (
             ("piper/tiny#1", 'no speaker "1"; the voice has one speaker'),
             ("piper/two#2", 'no speaker "2"; the voice has 2 speakers, 0 to 1'),
