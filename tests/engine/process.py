@@ -96,7 +96,7 @@ class Engine:
         code = f"{path}{before}\nfrom talkcli.engine.child import playback\n{settings}"
         with child_socket:
             self.process = subprocess.Popen(
-                [sys.executable, "-c", f"{code}from talkcli.engine.child.main import main\nmain()"],
+                [sys.executable, "-S", "-c", f"{code}from talkcli.engine.child.main import main\nmain()"],
                 stdin=child_socket.fileno(),
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,
