@@ -17,7 +17,7 @@ import pytest
 
 from talkcli.engine.child.players.chooser import MAX_CUT_S
 from tests.conformance import stopped
-from tests.conformance.hearing import HELP, HOME, LONG, LOW, assert_aborted, assert_same, await_word, heard, send
+from tests.conformance.hearing import HELP, HOME, LONG, LOW, assert_aborted, await_word, heard, send
 from tests.conformance.voices import ESPEAK, with_both
 from tests.support.compare import (
     EXTENT_TOLERANCE_S,
@@ -107,19 +107,6 @@ def test_row_30_a_text_is_spoken_and_never_executed(
     assert talk.run("say", "--wait", *LOW.split()).code == 0  # arguments are joined
     assert_heard(heard(talk), voice.render([*texts, LOW]))
     assert os.listdir(tmp_path) == []
-
-
-def test_the_wheels_library_speaks_if_the_system_has_none(
-    make_talk: MakeTalk, sink: Sink, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("espeakng_loader")
-    # The loader finds this file first and can't load it. The reference rendering comes from the wheel then, too.
-    (tmp_path / "libespeak-ng.so.1").touch()
-    monkeypatch.setenv("LD_LIBRARY_PATH", str(tmp_path))
-    talk = make_talk(sink=sink)
-    assert talk.run("say", "--wait", "--", LOW).code == 0
-    assert "(espeakng-loader)" in talk.log
-    assert_same(heard(talk), render([LOW])[0])
 
 
 def test_only_a_limited_silence_is_cut_between_queued_sentences(talk: Talk) -> None:

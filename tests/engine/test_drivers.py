@@ -295,6 +295,11 @@ espeak.load_library = without_english
             {"permanent": True},
         ),
         (
+            {"before": NO_LIBRARY + "import espeakng_loader; espeakng_loader.get_data_path = lambda: '/nowhere'"},
+            ["espeak-ng data is missing; install it with: ", "espeak-ng-data"],
+            {"permanent": True},
+        ),
+        (
             {"before": WITHOUT_ENGLISH},
             ['the driver "talk_espeak" could not be started: UnknownVoice: en'],
             {"permanent": False},

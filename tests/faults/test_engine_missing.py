@@ -1,6 +1,6 @@
 """The engine cannot start. Goals are aborted at once if the cause is permanent, and wait if it is temporary.
 
-A module or library in the environment of a real server shadows the installed one.
+A module in the environment of a real server shadows the installed one.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import signal
 import time
 from typing import TYPE_CHECKING
 
-import espeakng_loader
 import pytest
 
 from talkcli.engine.parent.supervisor import RESTART_DELAYS_S
@@ -47,41 +46,22 @@ with open({attempts!r}, "a") as file:
     file.write(str(time.monotonic()) + "\\n")
 raise ModuleNotFoundError("No module named " + repr(__name__), name=__name__)
 """
-#: The espeakng_loader package without its data.
-EMPTY = """
-def get_library_path():
-    return {real!r} + "/libespeak-ng.so"
-def get_data_path():
-    return "{empty}"
-"""
-WHEEL = os.path.dirname(espeakng_loader.__file__)
-#: The replaced module, its replacement, and the expected error. The system's library is missing, too.
-MISSING = {
-    "pyttsx3": ("pyttsx3", ABSENT, "pyttsx3 is missing ("),
-    "wheel": ("espeakng_loader", ABSENT, "libespeak-ng is missing ("),
-    "data": (
-        "espeakng_loader",
-        EMPTY,
-        "espeak-ng data is missing; install it with: sudo apt-get install -y libespeak-ng1 espeak-ng-data",
-    ),
-}
 
 
-@pytest.mark.parametrize("missing", MISSING)
 def test_goals_are_aborted_at_once_while_a_dependency_is_missing(
-    make_talk: MakeTalk, sink: Sink, tmp_path: Path, missing: str
+    make_talk: MakeTalk, sink: Sink, tmp_path: Path
 ) -> None:
-    name, module, error = MISSING[missing]
+    """`tests/engine/test_drivers.py` tests the error of each dependency."""
+    error = "pyttsx3 is missing ("
     attempts = write(tmp_path / "attempts", "")
     with limits():
-        shadow = write(tmp_path / f"{name}.py", module.format(real=WHEEL, empty=tmp_path, attempts=str(attempts)))
-        library = write(tmp_path / "libespeak-ng.so.1", "no library")
-        talk = make_talk(sink=sink, env={**python_path(tmp_path), "LD_LIBRARY_PATH": str(tmp_path)})
+        shadow = write(tmp_path / "pyttsx3.py", ABSENT.format(attempts=str(attempts)))
+        talk = make_talk(sink=sink, env=python_path(tmp_path))
         took = _assert_aborted_at_once(talk, error)
         assert talk.log.count(error) == 3, f"not once for the engine and once per goal: {talk.log}"
         assert_answers(talk)
-        times = _await_attempts(attempts, 3 if missing == "pyttsx3" else 0)
-        (shadow if missing == "pyttsx3" else library).unlink()
+        times = _await_attempts(attempts, 3)
+        shadow.unlink()
         with talk.connect() as wire:
             _await_engine(wire, "ready")
             times.append(time.monotonic())
