@@ -138,3 +138,11 @@ def talk(make_talk: MakeTalk, sink: Sink) -> Talk:
 def scripted(make_talk: MakeTalk) -> Talk:
     """A server with the scripted engine, without sound. The texts of goals control it (see `tests.support.script`)."""
     return make_talk(scripted=True)
+
+
+@pytest.fixture
+def soundless(make_talk: MakeTalk) -> Talk:
+    """A server with the real engine, which is ready, but without sound."""
+    talk = make_talk("--player", "null", "--rate", "450")
+    assert talk.run("voices").code == 0
+    return talk

@@ -24,16 +24,8 @@ if TYPE_CHECKING:
 LONG = "one two three four. " * 600
 
 
-@pytest.fixture
-def talk(make_talk: MakeTalk) -> Talk:
-    """A server without sound, whose engine is ready."""
-    talk = make_talk("--player", "null", "--rate", "450")
-    assert talk.run("voices").code == 0
-    return talk
-
-
-def test_speaking_begins_before_the_text_has_ended(talk: Talk) -> None:
-    typing = Typing(talk, "say", "--stream", "-wf", "-")
+def test_speaking_begins_before_the_text_has_ended(soundless: Talk) -> None:
+    typing = Typing(soundless, "say", "--stream", "-wf", "-")
     typing.type("Hel")
     typing.type("lo. How ar")
     while " word " not in (line := typing.line()):
@@ -44,31 +36,31 @@ def test_speaking_begins_before_the_text_has_ended(talk: Talk) -> None:
     assert (code, err) == (0, "")
     assert [line.split()[-1] for line in out if " word " in line] == ["How", "are", "you"]
     assert out[-1].endswith(" SUCCEEDED")
-    (goal_id,) = talk.watcher.goals()
-    assert talk.goal(goal_id)["text"] == "Hello. How are you?"
+    (goal_id,) = soundless.watcher.goals()
+    assert soundless.goal(goal_id)["text"] == "Hello. How are you?"
 
 
-def test_without_wait_the_command_ends_when_all_was_sent(talk: Talk) -> None:
-    talk.run("pause")
-    done = talk.run("say", "--stream", "--as", "model", "--key", "k", "--stall", "9", stdin="One.\nTwo.\n\n")
+def test_without_wait_the_command_ends_when_all_was_sent(soundless: Talk) -> None:
+    soundless.run("pause")
+    done = soundless.run("say", "--stream", "--as", "model", "--key", "k", "--stall", "9", stdin="One.\nTwo.\n\n")
     assert (done.code, len(done.out.split())) == (0, 1)
-    goal = talk.goal(done.out.strip())
+    goal = soundless.goal(done.out.strip())
     assert (goal["state"], goal["text"], goal["more"], goal["key"]) == ("PENDING", "One.\nTwo.", False, "k")
-    done = talk.run("--json", "say", "--stream", stdin="Three.")
+    done = soundless.run("--json", "say", "--stream", stdin="Three.")
     assert [json.loads(line)["text"] for line in done.out.splitlines()] == ["Three."]
-    assert talk.run("cancel").code == 0
-    assert talk.run("resume").code == 0
+    assert soundless.run("cancel").code == 0
+    assert soundless.run("resume").code == 0
 
 
 @pytest.mark.parametrize("text", ["", "\n", " \n", "\0"])
-def test_a_text_that_cannot_be_spoken_is_rejected_as_without_stream(talk: Talk, text: str) -> None:
-    done, plain = (talk.run("say", "-w", *words, "-", stdin=text) for words in (["--stream"], []))
+def test_a_text_that_cannot_be_spoken_is_rejected_as_without_stream(soundless: Talk, text: str) -> None:
+    done, plain = (soundless.run("say", "-w", *words, "-", stdin=text) for words in (["--stream"], []))
     assert (done.code, done.out) == (plain.code, plain.out) == (5, "")
     assert done.err.partition(": ")[2].partition(": ")[2] == plain.err.partition(": ")[2].partition(": ")[2] != ""
 
 
-def test_invalid_bytes_are_reported_once(talk: Talk) -> None:
-    client = talk.start("say", "--stream", "-w", stdin=subprocess.PIPE)
+def test_invalid_bytes_are_reported_once(soundless: Talk) -> None:
+    client = soundless.start("say", "--stream", "-w", stdin=subprocess.PIPE)
     assert client.stdin
     for data in (b"One \xc3", b"\xa4", b"\n\xff two \xfe", b"\xff"):
         client.stdin.buffer.write(data)  # type: ignore[attr-defined]
@@ -77,84 +69,74 @@ def test_invalid_bytes_are_reported_once(talk: Talk) -> None:
     _, err = client.communicate(timeout=20)
     assert client.returncode == 0
     assert err == "talk: line 2, column 1: the byte 0xff is not valid UTF-8 and is skipped (1 more like it)\n"
-    assert talk.goal(talk.watcher.goals()[0])["text"] == "One ä\n\ufffd two \ufffd\ufffd"
+    assert soundless.goal(soundless.watcher.goals()[0])["text"] == "One ä\n\ufffd two \ufffd\ufffd"
 
 
-def test_the_producer_is_stopped_if_the_goal_ends(talk: Talk) -> None:
+def test_the_producer_is_stopped_if_the_goal_ends(soundless: Talk) -> None:
     """The producer never stops writing, so only SIGPIPE can end it."""
     code = (
         "import signal, sys; signal.signal(signal.SIGPIPE, signal.SIG_DFL)\nwhile True: sys.stdout.write('one two. ')"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as producer:
         assert producer.stdout
-        client = talk.start("say", "--stream", "-w", stdin=producer.stdout.fileno())
+        client = soundless.start("say", "--stream", "-w", stdin=producer.stdout.fileno())
         producer.stdout.close()
         assert client.stdout
         goal_id = client.stdout.readline().strip()
-        talk.watcher.wait_for(goal_id, "ACTIVE")
-        assert talk.run("say", "--preempt", "-w", "other").code == 0
+        soundless.watcher.wait_for(goal_id, "ACTIVE")
+        assert soundless.run("say", "--preempt", "-w", "other").code == 0
         _, err = client.communicate(timeout=20)
         assert client.returncode == 7
         assert err.startswith(f"talk: {goal_id}: ")
         assert producer.wait(5) == -signal.SIGPIPE
 
 
-def test_a_signal_ends_the_command_before_there_is_text(talk: Talk) -> None:
-    connected = talk.request("status")["server"]["clients"]
-    typing = Typing(talk, "say", "--stream", "-w")
-    while talk.request("status")["server"]["clients"] <= connected:
+def test_a_signal_ends_the_command_before_there_is_text(soundless: Talk) -> None:
+    connected = soundless.request("status")["server"]["clients"]
+    typing = Typing(soundless, "say", "--stream", "-w")
+    while soundless.request("status")["server"]["clients"] <= connected:
         time.sleep(0.01)
     assert typing.end(signal.SIGTERM) == (128 + signal.SIGTERM, [], "")
 
 
-def test_ctrl_c_cancels_the_goal(talk: Talk) -> None:
+def test_ctrl_c_cancels_the_goal(soundless: Talk) -> None:
     for options, text in (([], "One. Two"), (["-f"], LONG)):
-        typing = Typing(talk, "say", "--stream", "-w", *options)
+        typing = Typing(soundless, "say", "--stream", "-w", *options)
         typing.type(text)
         goal_id = typing.line().split()[0]
-        talk.watcher.wait_for(goal_id, "ACTIVE")
+        soundless.watcher.wait_for(goal_id, "ACTIVE")
         started_at = time.monotonic()
         code, _, err = typing.end(signal.SIGINT)
         assert_within(time.monotonic() - started_at, 1, "the end after Ctrl-C")
         assert code == 128 + signal.SIGINT
         assert err.startswith(f"talk: {goal_id}: ")
-        assert talk.goal(goal_id)["state"] == "PREEMPTED"
+        assert soundless.goal(goal_id)["state"] == "PREEMPTED"
 
 
-def test_a_goal_is_cancelled_after_the_timeout(talk: Talk) -> None:
+def test_a_goal_is_cancelled_after_the_timeout(soundless: Talk) -> None:
     for text, details in (("", ": nothing was sent"), ("One. ", "")):
-        typing = Typing(talk, "say", "--stream", "-w", "-t", "0.5")
+        typing = Typing(soundless, "say", "--stream", "-w", "-t", "0.5")
         typing.type(text)
         code, err = typing.client.wait(20), typing.errors.read()
         assert code == 124
         assert err.splitlines()[-1] == f"talk: timed out after 0.5 s{details}"
         typing.client.stdin.close()  # type: ignore[union-attr]
-    assert [talk.goal(each)["state"] for each in talk.watcher.goals()] == ["PREEMPTED"]
+    assert [soundless.goal(each)["state"] for each in soundless.watcher.goals()] == ["PREEMPTED"]
 
 
-def test_the_limit_for_missing_text_can_be_set(talk: Talk) -> None:
-    typing = Typing(talk, "say", "--stream", "-w", "--stall", "1")
+def test_the_limit_for_missing_text_can_be_set(soundless: Talk) -> None:
+    typing = Typing(soundless, "say", "--stream", "-w", "--stall", "1")
     typing.type("One. ")
     assert typing.client.wait(20) == 4
     assert "no more text arrived for 1 s" in typing.errors.read()
     typing.client.stdin.close()  # type: ignore[union-attr]
 
 
-def test_a_killed_command_breaks_the_text_off(talk: Talk) -> None:
-    typing = Typing(talk, "say", "--stream", "-w")
-    typing.type("One. Two three")
-    goal_id = typing.line()
-    talk.watcher.wait_for(goal_id, "ACTIVE")
-    typing.client.kill()
-    assert talk.watcher.wait_for_terminal(goal_id) == "ABORTED"
-    assert talk.goal(goal_id)["reason"] == "broken_off"
-
-
-def test_a_lost_server_is_reported(talk: Talk) -> None:
-    typing = Typing(talk, "say", "--stream", "-w")
+def test_a_lost_server_is_reported(soundless: Talk) -> None:
+    typing = Typing(soundless, "say", "--stream", "-w")
     typing.type("One. ")
     typing.line()
-    talk.kill()
+    soundless.kill()
     assert typing.client.wait(20) == 12
     assert "the sentence may still be spoken" in typing.errors.read()
 
@@ -189,10 +171,10 @@ def test_options_that_cannot_be_combined_are_refused(words: list[str], message: 
     assert message in done.err
 
 
-def test_a_terminal_shows_the_text_as_it_grows(talk: Talk) -> None:
+def test_a_terminal_shows_the_text_as_it_grows(soundless: Talk) -> None:
     code = "import sys, time\nfor text in sys.argv[1:]: print(end=text, flush=True), time.sleep(0.4)"
     line = f'{sys.executable} -c "$CODE" "Hello. " "How are " "you?" | {" ".join(TALK)} say --stream -wf'
-    terminal = Terminal(["bash", "-c", line], {**talk.env, "CODE": code}, 80)
+    terminal = Terminal(["bash", "-c", line], {**soundless.env, "CODE": code}, 80)
     try:
         terminal.wait_until(lambda screen: "WAITING    Hello." in screen.last)
         assert terminal.finish() == 0
@@ -201,10 +183,10 @@ def test_a_terminal_shows_the_text_as_it_grows(talk: Talk) -> None:
         terminal.close()
 
 
-def test_wait_shows_a_growing_text_as_far_as_it_was_heard(talk: Talk) -> None:
-    typing = Typing(talk, "say", "--stream", "-w")
+def test_wait_shows_a_growing_text_as_far_as_it_was_heard(soundless: Talk) -> None:
+    typing = Typing(soundless, "say", "--stream", "-w")
     typing.type("One. ")
-    terminal = Terminal([*TALK, "wait", "-f", typing.line()], talk.env, 80)
+    terminal = Terminal([*TALK, "wait", "-f", typing.line()], soundless.env, 80)
     try:
         terminal.wait_until(lambda screen: "WAITING    One." in screen.last)
         typing.type("Two three. ")

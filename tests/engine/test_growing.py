@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import time
-import wave
 from typing import TYPE_CHECKING
 
-import numpy as np
 import pytest
 
 from talkcli.engine import protocol
@@ -56,18 +54,6 @@ def test_a_growing_text_is_heard_like_a_whole_one(sink: Sink) -> None:
         recording.wait_until_quiet(0.3)
     assert (ended.outcome, ended.gaps) == (protocol.OUTCOME_COMPLETED, 0)
     assert_heard(recording, render([Sentence(TEXT, rate=RATE)]))
-
-
-def test_a_file_gets_the_same_samples(tmp_path: Path) -> None:
-    lengths = []
-    for name, send in (("whole", Engine.say), ("grown", grow)):
-        with Engine(f"file:{tmp_path / name}") as engine:
-            send(engine, TEXT)
-            assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
-        with wave.open(str(tmp_path / name)) as file:
-            samples = np.frombuffer(file.readframes(file.getnframes()), np.int16)
-        lengths.append(len(samples))
-    assert lengths[0] == pytest.approx(lengths[1], abs=22050 * 0.03)
 
 
 def test_words_have_their_places_in_the_whole_text(tmp_path: Path) -> None:
@@ -148,12 +134,6 @@ def test_text_for_a_goal_that_has_ended_is_ignored(engine: Engine) -> None:
     engine.send(protocol.Append("g1", " Two.", end=True))
     assert engine.spoken("Three.", "g2").outcome == protocol.OUTCOME_COMPLETED
     assert len(engine.words("g1")) == len(engine.words("g2")) == 1
-
-
-def test_a_text_without_speech_can_not_be_spoken(engine: Engine) -> None:
-    grow(engine, "... ... ...")
-    ended = engine.until(protocol.Ended)
-    assert (ended.outcome, ended.reason) == (protocol.OUTCOME_FAILED, Reason.NOTHING_TO_SAY)
 
 
 def test_another_driver_refuses_a_growing_text() -> None:

@@ -15,7 +15,6 @@ from tests.readme.blocks import block, runs
 from tests.support.surroundings import needs
 
 if TYPE_CHECKING:
-    from tests.conftest import MakeTalk
     from tests.readme.shell import Shell
     from tests.support.processes import Talk
 
@@ -27,11 +26,8 @@ _CHANGES = {
 
 
 @pytest.fixture
-def speaking(make_talk: MakeTalk) -> Talk:
-    """A server without sound, whose engine is ready."""
-    talk = make_talk("--player", "null", "--rate", "450")
-    assert talk.run("voices").code == 0
-    return talk
+def speaking(soundless: Talk) -> Talk:
+    return soundless
 
 
 def wait_for_word(talk: Talk, answer: str) -> str:
