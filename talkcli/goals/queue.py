@@ -64,13 +64,10 @@ class Queue:
         """
         return next((each for each in self if each.say.text == text), None)
 
-    def goals_up_to(self, priority: int) -> list[Record]:
-        """Return all goals with this priority or a lower one."""
-        return list(map(_record_of, self._goals[bisect_left(self._goals, (-priority,)) :]))
-
-    def preempting_goals_up_to(self, priority: int) -> list[Record]:
-        """Return all preempting goals with this priority or a lower one."""
-        return list(map(_record_of, self._preempting[bisect_left(self._preempting, (-priority,)) :]))
+    def goals_up_to(self, priority: int, *, only_preempting: bool) -> list[Record]:
+        """Return all goals, or only the preempting ones, with this priority or a lower one."""
+        goals = self._preempting if only_preempting else self._goals
+        return list(map(_record_of, goals[bisect_left(goals, (-priority,)) :]))
 
     def displaceable_goal(self) -> Record | None:
         """Return the newest goal of the lowest priority, if any.

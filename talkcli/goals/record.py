@@ -65,8 +65,6 @@ class Record:
     passed_chars: int = 0
     #: monotonic time by which more text must arrive, or inf
     stalls_at: float = inf
-    #: if the sender left, monotonic time by which another connection must continue the text, otherwise inf
-    orphaned_until: float = inf
     #: whether the goal is paused
     paused: bool = False
     #: how often the goal has been paused

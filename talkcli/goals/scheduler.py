@@ -132,8 +132,8 @@ class Scheduler:
         self.paused = False
         #: whether goals can start. If no engine can be started, they start and fail at once.
         self.has_engine = False
-        #: goals whose sender left before their text ended
-        self._orphans: list[Record] = []
+        #: goals whose sender left before their text ended, and when they end if no other connection continues the text
+        self._orphans: dict[Record, float] = {}
         #: whether `shutdown` was called, so that new goals are rejected
         self.closing = False
         #: whether an engine process is running that can load voices
@@ -209,7 +209,7 @@ class Scheduler:
         first = self.find(say.id) if say.id is not None and options.is_clients_id(say.id) else None
         if first is not None and first.was_sent_as(say.text):
             if say.more:
-                self._stop_awaiting_sender(first)
+                self._orphans.pop(first, None)
             return first, []
         self._count += 1
         ttl = (self.settings.ttl if say.ttl is None else say.ttl) or None
@@ -305,11 +305,12 @@ class Scheduler:
             return []
         if refused := options.bad_characters(added, self.max_text * options.GROWTH_FACTOR, len(text)):
             raise RequestRefused(refused[1], refused[0])
-        self._stop_awaiting_sender(record)
-        record.say, record.more = replace(record.say, text=text + added), addition.broken or not addition.end
-        self._reset_stall_limit(record, now)
+        record.say = replace(record.say, text=text + added)
         if addition.broken:
             return self.break_off(record, now, at_once=True)
+        self._orphans.pop(record, None)
+        record.more = not addition.end
+        self._reset_stall_limit(record, now)
         return [EngineOrder(record, Order.APPEND)] if record.state is State.ACTIVE and (added or addition.end) else []
 
     def producer_left(self, record: Record, now: Now) -> list[Effect]:
@@ -319,9 +320,7 @@ class Scheduler:
         """
         if not record.more or record.say.id is None:
             return self.break_off(record, now)
-        if record not in self._orphans:
-            record.orphaned_until = now.monotonic + record.say.stall
-            self._orphans.append(record)
+        self._orphans.setdefault(record, now.monotonic + record.say.stall)
         return []
 
     def break_off(self, record: Record, now: Now, *, at_once: bool = False) -> list[Effect]:
@@ -329,7 +328,7 @@ class Scheduler:
 
         A goal that hasn't started always ends at once.
         """
-        self._stop_awaiting_sender(record)
+        self._orphans.pop(record, None)
         if not (record.more and record.state in {State.PENDING, State.ACTIVE}):
             return []
         if record.state is State.PENDING:
@@ -561,8 +560,8 @@ class Scheduler:
 
     def deadline(self) -> float:
         """Return the monotonic time at which `tick` must be called next, or inf for never."""
-        orphans = min((each.orphaned_until for each in self._orphans), default=inf)
-        return min(self._active_deadline(), self.pending.next_expiry(), self._next_deadline(), orphans)
+        deadlines = (self._active_deadline(), self.pending.next_expiry(), self._next_deadline())
+        return min(*deadlines, *self._orphans.values())
 
     def tick(self, now: Now) -> list[Effect]:
         """Handle all time limits that have been reached. Return the effects.
@@ -582,7 +581,7 @@ class Scheduler:
                 )
                 effects = [EngineOrder(record, Order.GIVE_UP)]
                 effects += self._end(record, State.ABORTED, Reason.NOT_SILENT, words, record.by, now)
-        for each in [each for each in self._orphans if now.monotonic >= each.orphaned_until]:
+        for each in [each for each, ends_at in self._orphans.items() if now.monotonic >= ends_at]:
             effects += self.break_off(each, now)
         return effects + self._expire(now) + self._start_next(now) + self._order_next_voice(now)
 
@@ -659,10 +658,8 @@ class Scheduler:
         """Return the goals to remove for a new goal and the reasons, or None if there is no room."""
         replaced = self.pending.with_key(say.key)
         preempted: list[Record] = []
-        if say.flush:
-            preempted = self.pending.goals_up_to(say.priority)
-        elif self._may_preempt(say):
-            preempted = self.pending.preempting_goals_up_to(say.priority)
+        if self._may_preempt(say):
+            preempted = self.pending.goals_up_to(say.priority, only_preempting=not say.flush)
         recalled = [(replaced, Reason.REPLACED)] if replaced else []
         recalled += [(each, Reason.PREEMPTED) for each in preempted if each is not replaced]
         # The queue never exceeds its limit, so removing one goal is enough.
@@ -816,12 +813,6 @@ class Scheduler:
         record.paused = False
         return [StateChange(record, State.PREEMPTING), EngineOrder(record, Order.STOP)]
 
-    def _stop_awaiting_sender(self, record: Record) -> None:
-        """Stop waiting for a new connection to continue the text of a goal."""
-        if record in self._orphans:
-            self._orphans.remove(record)
-        record.orphaned_until = inf
-
     def _reset_stall_limit(self, record: Record, now: Now) -> None:
         """Restart the time limit for more text if a goal waits for text. Otherwise, remove the limit."""
         record.stalls_at = now.monotonic + record.say.stall if record.waits and record.more else inf
@@ -839,7 +830,7 @@ class Scheduler:
         record.change_state(state)
         record.reason, record.message, record.by = reason, message, by
         record.ended_at, record.paused, record.more, record.waits = now.wall, False, False, False
-        self._stop_awaiting_sender(record)
+        self._orphans.pop(record, None)
         if record.begun_end and state is not State.ABORTED:
             self._speech_times.add(record)
         self._by_id.pop(record.id)

@@ -273,7 +273,7 @@ class Requests:
             if not self._reserve_memory(pending):
                 break  # too many requests are waiting
             speech.subscribers.schedule_keep_alive()
-            await pending.wait(speech.waiting_for_hearing(record))
+            await pending.wait(speech.waiting_for_hearing[record])
         pending.answer(length=len(record.say.text), state=record.state.name)
 
     def _require_producer(self, record: Record, connection: ClientConnection) -> None:
@@ -335,7 +335,7 @@ class Requests:
         speech.notifications.add(notifications)
         if result.stopping:
             while not result.stopping.state.terminal:
-                await pending.wait(speech.waiting_for_silence(result.stopping))
+                await pending.wait(speech.waiting_for_silence[result.stopping])
         else:
             await speech.notifications.wait_done(pending)
         ended = result.recalled + [each.canceled_goal for each in waiting if each.canceled_goal]
@@ -360,7 +360,7 @@ class Requests:
         speech.apply(effects)
         active = scheduler.active
         if active and active is not speech.silent_goal:
-            in_time = await pending.wait(speech.waiting_for_silence(active), PAUSE_ANSWER_S)
+            in_time = await pending.wait(speech.waiting_for_silence[active], PAUSE_ANSWER_S)
             if not in_time:
                 words = f"speech is paused, but {active.id} was not confirmed to be silent within {PAUSE_ANSWER_S:g} s"
                 raise RequestRefused(words, Reason.NOT_SILENT)
@@ -379,7 +379,7 @@ class Requests:
             self._publish_pause(active, pending)
         speech.apply(effects)
         if active:
-            resume_all(speech.waiting_for_silence(active))  # requests that wait for silence can be answered now
+            resume_all(speech.waiting_for_silence[active])  # requests that wait for silence can be answered now
         self._answer_pause(pending, active)
 
     def _publish_pause(self, affected: Record | None, pending: PendingRequest) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections import deque
+from collections import defaultdict, deque
 from functools import partial
 from itertools import chain
 from math import inf
@@ -115,9 +115,9 @@ class Speech:
         self.notifications.on_done = self._finish_if_all_ended
         self._timer: asyncio.TimerHandle | None = None
         #: requests that are waiting for a goal to become silent or to end
-        self._waiting_for_silence: dict[Record, WaitingList] = {}
+        self.waiting_for_silence: defaultdict[Record, WaitingList] = defaultdict(dict)
         #: `append` requests that are waiting until more of their goal's text has been heard
-        self._waiting_for_hearing: dict[Record, WaitingList] = {}
+        self.waiting_for_hearing: defaultdict[Record, WaitingList] = defaultdict(dict)
         #: the paused goal, if the engine has confirmed that it is silent
         self.silent_goal: Record | None = None
         #: unprocessed reports from the engine thread
@@ -145,22 +145,14 @@ class Speech:
         """Whether the engine is still expected to list its voices."""
         return self.voices.listed is None and self.engine_status in {"starting", READY}
 
-    def waiting_for_silence(self, record: Record) -> WaitingList:
-        """Return the requests that wait for a goal to become silent or to end."""
-        return self._waiting_for_silence.setdefault(record, {})
-
-    def waiting_for_hearing(self, record: Record) -> WaitingList:
-        """Return the requests that wait until more of this goal's text has been heard."""
-        return self._waiting_for_hearing.setdefault(record, {})
-
     def _waiting_for_room(self) -> Iterator[ClientConnection]:
         """Yield the connections whose goals wait for room in the queue, or whose texts wait to be heard."""
-        for each in chain(self.waiting_for_room, *self._waiting_for_hearing.values()):
+        for each in chain(self.waiting_for_room, *self.waiting_for_hearing.values()):
             yield each.connection
 
     def _resume_appends(self, record: Record) -> None:
         """Resume a goal's waiting `append` requests if enough of its text has been heard."""
-        waiting = self._waiting_for_hearing.get(record)
+        waiting = self.waiting_for_hearing.get(record)
         if waiting and unheard_chars(record) <= MAX_UNHEARD_CHARS:
             resume_all(waiting)
 
@@ -262,8 +254,8 @@ class Speech:
         self.subscribers.state_changed(record, state, at)
         if state.terminal:
             _log_goal_end(record, monotonic_now() - record.began_at)
-            resume_all(self._waiting_for_silence.pop(record, {}))
-            resume_all(self._waiting_for_hearing.pop(record, {}))
+            resume_all(self.waiting_for_silence.pop(record, {}))
+            resume_all(self.waiting_for_hearing.pop(record, {}))
 
     def _set_timer(self) -> None:
         """Set the timer for the scheduler's next time limit."""
@@ -350,7 +342,7 @@ class Speech:
             case protocol.Held():
                 if active.paused and active.pause_count == event.number:
                     self.silent_goal = active
-                    resume_all(self.waiting_for_silence(active))
+                    resume_all(self.waiting_for_silence[active])
 
     def _process_voice_event(self, event: protocol.VoiceEvent, now: Now) -> None:
         """Process a report about a voice, or the engine's list of voices."""
