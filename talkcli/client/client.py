@@ -94,7 +94,7 @@ class Client:
     @property
     def server_pid(self) -> int | None:
         """The server's process id."""
-        return self._connection.pid
+        return self._connection.server.pid
 
     def close(self) -> None:
         """Close the connection. Goals that were sent are still spoken."""

@@ -176,7 +176,7 @@ class EventListeners:
             state = event.state if isinstance(event, StateChanged) and not event.goal else None
             if state is State.PENDING or (state and state.terminal):
                 return  # clients that watch all goals receive this event again, with the whole goal
-        elif not isinstance(event, events.TextAdded | Snapshot):
+        elif event is None:
             return
         for buffer in self.watches:
             buffer.add(event)
@@ -297,9 +297,7 @@ class ServerInfo:
     @classmethod
     def read(cls, server: JsonObject) -> ServerInfo:
         """Read a server's description from a JSON object. Ignore invalid fields."""
-        features = server.get("features")
-        names = tuple(map(str, features)) if isinstance(features, list) else None
-        return cls(**{**read_fields(cls, {**server, "features": None}), "features": names})
+        return cls(**read_fields(cls, server))
 
 
 def read_greeting(line: bytes, path: str) -> ServerInfo:
@@ -415,11 +413,6 @@ class ClientCore:
     def boot(self) -> str:
         """The server's boot id, which is the first part of its goal ids."""
         return self.server.boot
-
-    @property
-    def pid(self) -> int | None:
-        """The server's process id."""
-        return self.server.pid
 
     # -- requests
 
@@ -539,7 +532,7 @@ class ClientCore:
             return None
         from talkcli.terminal.text import printable  # rarely needed, and slow to import
 
-        version, name = printable(self.server.version), FEATURES[missing[0]].name
+        version, name = printable(self.server.version), FEATURES[missing[0]][0]
         return ProtocolMismatch(f"the server (version {version}) does not support {name}; restart it")
 
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:

@@ -67,8 +67,7 @@ class Presence:
         said = _decode_object(payload)
         if said is None or topics.name_fault(name):
             return None
-        lists = {each: _strings_in(said.pop(each, None)) for each in ("groups", "allow")}
-        return cls(**{**read_fields(cls, said), **lists, "name": name})
+        return cls(**{**read_fields(cls, said), "name": name})
 
     def to_json(self) -> JsonObject:
         """Return the presence as a JSON object, without the robot's name."""
@@ -161,11 +160,6 @@ def _decode_object(payload: bytes) -> JsonObject | None:
         return decode(payload.strip())
     except BadRequest:
         return None
-
-
-def _strings_in(value: object) -> tuple[str, ...]:
-    """Return the strings in a list. For any other value, return an empty tuple."""
-    return tuple(each for each in value if isinstance(each, str)) if isinstance(value, list) else ()
 
 
 # -- Home Assistant

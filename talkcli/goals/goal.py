@@ -211,12 +211,18 @@ def read_seconds(value: object) -> float | None:
     return float(value) if number and abs(value) <= _MAX_TIME_S else None  # type: ignore[arg-type]
 
 
-#: Functions that read a field's value, by type annotation. They return None if the value has the wrong type.
+def _read_strings(value: object) -> tuple[str, ...] | None:
+    """Return the strings in a list, or None if the value is not a list."""
+    return tuple(each for each in value if isinstance(each, str)) if isinstance(value, list) else None
+
+
+#: Functions that read a field's value, by the first word of its type. They return None if the value has the wrong type.
 _READERS: dict[str, Callable[[object], object]] = {
     "str": _create_reader(str),
     "int": _create_reader(int),
     "float": read_seconds,
     "bool": _create_reader(bool),
+    "tuple[str,": _read_strings,
     "JsonObject": _create_reader(dict),
     "State": lambda value: State.__members__.get(value) if isinstance(value, str) else None,
     "By": By.from_json,

@@ -240,6 +240,8 @@ class Option:
             return None
         if self.limits != (None, None) and self.is_out_of_range(value):
             return f"the {self.name} must be {self.range}{self.unit}, got {value}"
+        if self.choices and value not in self.choices:
+            return f"the {self.name} must be {' or '.join(map(repr, self.choices))}, got {value[:MAX_ID_CHARS]!r}"
         return self.check(value) if self.check else None
 
     def is_out_of_range(self, value: float) -> bool:
@@ -297,13 +299,6 @@ def _check_own_id(value: str) -> str | None:
         f"the id {value[:MAX_ID_CHARS]!a} is not allowed: use 1 to {MAX_ID_CHARS} characters from A-Z a-z 0-9 . _ : "
         "/ -; an id can't be a number, begin with '-', or look like one of the server's own ids, such as 4k7f-12"
     )
-
-
-def _check_format(value: str) -> str | None:
-    """Return an error message if the format of a text is not supported."""
-    if value in {"text", MARKDOWN}:
-        return None
-    return f"the format must be 'text' or 'markdown', got {value[:MAX_ID_CHARS]!r}"
 
 
 def _check_voice(value: str) -> str | None:
@@ -525,7 +520,7 @@ OPTIONS = (
         TEXT,
         "how the text is written. The marks of Markdown are not spoken, see [Markdown](../cli/README.md#markdown)",
         default="text",
-        check=_check_format,
+        choices=("text", MARKDOWN),
         form=f"`text` or `{MARKDOWN}`",
         special_flags="--markdown",
         flag_value=MARKDOWN,

@@ -204,8 +204,7 @@ class Snapshot:
 Event = StateChanged | WordHeard | TextAdded | TextMissing | PausedChanged | Result | Snapshot
 
 #: Event classes by kind. Snapshot is missing, because its fields differ from those of its message.
-_EVENTS_BY_KIND: dict[str, type[Event]]
-_EVENTS_BY_KIND = {
+_EVENTS_BY_KIND: dict[str, type[Event]] = {
     "state": StateChanged,
     "word": WordHeard,
     "text": TextAdded,

@@ -6,31 +6,23 @@ name is missing. Otherwise, an older server would refuse the request with a mess
 
 from __future__ import annotations
 
-from talkcli.frozen import TYPE_CHECKING, frozen
+from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection
+    from collections.abc import Collection
 
     from talkcli.goals.goal import JsonObject
 
 
-@frozen
-class Feature:
-    """A feature of the protocol that older servers lack."""
-
-    #: the feature's name in error messages, for example "growing texts"
-    name: str
-    #: function that returns whether a request needs the feature
-    is_needed: Callable[[JsonObject], bool]
-
-
-#: All features, by name. Never remove one.
+#: All features. Each has a name for error messages, and the field and the value of the requests that need it. Never
+#: remove a feature.
 FEATURES = {
-    "append": Feature("growing texts", lambda request: request.get("more") is True),
-    "markdown": Feature("Markdown", lambda request: request.get("format") == "markdown"),
+    "append": ("growing texts", "more", True),
+    "markdown": ("Markdown", "format", "markdown"),
 }
 
 
 def missing_features(request: JsonObject, available: Collection[str]) -> list[str]:
     """Return the names of the features that a request needs and the server lacks."""
-    return [name for name, each in FEATURES.items() if name not in available and each.is_needed(request)]
+    needed = (name for name, (_, field, value) in FEATURES.items() if request.get(field) == value)
+    return [each for each in needed if each not in available]

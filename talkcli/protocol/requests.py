@@ -172,7 +172,7 @@ def read_request(message: JsonObject) -> Request:
             raise BadRequest(f"{kind}: {name!r} {fault}", "bad_field")
         if isinstance(value, list):
             fields[name] = tuple(value)
-    required = {Say: "text", Append: "id"}.get(request)
-    if required and required not in fields:
-        raise BadRequest(f"{kind}: {required!r} is missing", "bad_field")
+    for option in request.options:
+        if option.default_words == "required" and option.name not in fields:
+            raise BadRequest(f"{kind}: {option.name!r} is missing", "bad_field")
     return request(**fields)  # type: ignore[arg-type]

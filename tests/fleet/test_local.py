@@ -75,7 +75,7 @@ async def test_a_greeting_may_arrive_late_or_in_pieces(
             await asyncio.sleep(wait)
             server.sendall(part)
         local = await dialing
-        assert (local.boot, local.pid) == ("a1b2", 7)
+        assert (local.boot, local.server.pid) == ("a1b2", 7)
         assert local.send(Exchange(Status()))
         server.sendall(b"answered\n")
         assert await asyncio.to_thread(lines, server, 2) == [

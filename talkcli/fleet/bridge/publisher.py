@@ -18,7 +18,7 @@ from talkcli.fleet import topics
 from talkcli.fleet.bridge.local import dial
 from talkcli.fleet.bridge.policy import PRIVATE_FIELDS
 from talkcli.fleet.payloads import LastGoal, Message, RobotStatus
-from talkcli.frozen import replace
+from talkcli.frozen import fields, replace
 from talkcli.goals.options import MAX_LOG_GOALS
 from talkcli.goals.states import State
 from talkcli.protocol.events import (
@@ -159,11 +159,10 @@ class Publisher:
         self._retry_s = _FIRST_SERVER_RETRY_S
         for each in unfinished(status):
             self._sessions.remember(each, server.boot)
-        log.write(f"connected to the server at {log.sanitize(server.path)} (pid {server.pid})")
-        server_info: JsonObject = {"boot": server.boot, "pid": server.pid, "version": status.server.get("version")}
+        log.write(f"connected to the server at {log.sanitize(server.path)} (pid {server.server.pid})")
         # Leave out features that this bridge doesn't know, because it may be unable to pass on their requests.
-        server_info["features"] = [each for each in FEATURES if each in (server.server.features or ())]
-        self._set_server(server_info, status, server.boot)
+        features = [each for each in FEATURES if each in (server.server.features or ())]
+        self._set_server({**fields(server.server), "features": features}, status, server.boot)
 
     def _set_server(self, server_info: JsonObject | None, status: ServerStatus, boot: str) -> None:
         """Store the new state of the server and its goals, and report the change."""
