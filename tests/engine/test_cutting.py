@@ -204,12 +204,12 @@ def test_blanks_are_no_part(text: str) -> None:
 def test_the_rest_of_a_text_that_ends_is_one_part() -> None:
     growing = GrowingText("One. Two. Three.", ended=False)
     assert growing.take_next_part(0, 9) == (0, 4)
-    growing.end()
+    growing.ended = True
     assert (growing.finished, growing.take_next_part(0, 9), growing.finished) == (False, (5, 16), True)
     growing = GrowingText("One. T", ended=False)
     assert growing.take_next_part(0, 9) == (0, 4)
     growing.append("wo. \n", 0)
-    growing.end()
+    growing.ended = True
     assert (growing.take_next_part(0, 9), growing.finished) == ((5, 11), True)
 
 
@@ -334,7 +334,7 @@ def test_the_parts_are_the_text_without_some_blanks(
         growing.drop_incomplete()
         assert text.startswith(growing.text)
     else:
-        growing.end()
+        growing.ended = True
         assert growing.text == text
     if part := growing.take_next_part(now, 0):
         parts.append(part)

@@ -121,10 +121,6 @@ class GrowingText:
             self.text += text
             self._changed_at = now
 
-    def end(self) -> None:
-        """Mark the text as complete."""
-        self.ended = True
-
     def drop_incomplete(self) -> None:
         """Mark the text as complete, and drop an incomplete sentence at its end.
 

@@ -156,8 +156,8 @@ class PlayerFeed:
         self.progress_at = time.monotonic()
         self._rate = rate
         self._clock = clock
-        #: time at which the stream began, plus the time for which the player had nothing to play
-        self._began_at = 0.0
+        #: time at which the stream began, plus the time for which the player was silent because text was missing
+        self.began_at = 0.0
         #: time at which everything written will have been heard
         self._heard_at = 0.0
         #: bytes of silence to write before the first sample
@@ -173,7 +173,7 @@ class PlayerFeed:
         if taken:
             now = time.monotonic()
             if self.written == 0:
-                self._began_at = now
+                self.began_at = now
                 self._clock.start(now)
             self.written += taken
             self.progress_at = now
@@ -229,11 +229,7 @@ class PlayerFeed:
 
     def missing_seconds(self, now: float) -> float:
         """Return how many seconds of audio would be lost if the player ended now."""
-        return self._began_at + self._seconds(self.written) - now
-
-    def add_delay(self, seconds: float) -> None:
-        """Record that the player had nothing to play for some time, because the text was missing."""
-        self._began_at += seconds
+        return self.began_at + self._seconds(self.written) - now
 
     def _seconds(self, byte_count: int) -> float:
         """Return the duration of this many bytes of samples."""
@@ -346,12 +342,7 @@ class Playback:
         This method may return early. If the player runs out of samples in the meantime, it doesn't count as stalled.
         """
         self._in_background = True
-        more = (descriptor, select.POLLIN)
-        if self._feed is not None:
-            self._with_player(lambda feed: self._await_samples(feed, [more]))
-            return
-        self._wait_for_continue()
-        self._wait((more,))
+        self._keep_playing([(descriptor, select.POLLIN)])
 
     # -- methods for the driver
 
@@ -373,12 +364,7 @@ class Playback:
     def await_text(self, until: float) -> None:
         """Keep playing until more text may have arrived or time is up."""
         self._text_was_missing = True
-        if self._feed is not None:
-            self._with_player(lambda feed: self._await_samples(feed, until=until))
-        elif self._runner.hold_number:
-            self._wait_for_continue()
-        else:
-            self._wait(until=until)
+        self._keep_playing(until=until)
 
     def finish(self) -> float:
         """Play the sentence to its end. Return its length in seconds.
@@ -529,7 +515,7 @@ class Playback:
             if time.monotonic() >= due and not self._runner.hold_number and not self._offer_next(feed):
                 raise CannotSpeak(Reason.AUDIO_STALLED, f"{feed.player.name} accepted no sound for {limit:g} s")
 
-    def _await_samples(self, feed: PlayerFeed, interests: Sequence[Interest] = (), until: float = NEVER) -> None:
+    def _await_samples(self, feed: PlayerFeed, interests: Sequence[Interest], until: float) -> None:
         """Offer any unsent samples. Then wait once for the player, a descriptor or the time limit.
 
         This is called while the next samples or more text are late, so the player doesn't count as stalled. If the
@@ -598,7 +584,7 @@ class Playback:
             taken = feed.offer(part)
         if taken and self._text_was_missing:
             self._text_was_missing = False
-            feed.add_delay(silent)
+            feed.began_at += silent
         elif taken and self._in_background and feed.player.real_time and silent > INAUDIBLE_GAP_S:
             self.gaps.append(silent)
         self._sent += taken
@@ -713,6 +699,18 @@ class Playback:
         return bool(self._runner.hold_number) and feed.buffered(time.monotonic()) >= HOLD_SILENCE_LIMIT_S
 
     # -- waiting
+
+    def _keep_playing(self, interests: Sequence[Interest] = (), until: float = NEVER) -> None:
+        """Keep playing until a descriptor is ready or time is up.
+
+        This method may return early, for example after a pause.
+        """
+        if self._feed is not None:
+            self._with_player(lambda feed: self._await_samples(feed, interests, until))
+        elif self._runner.hold_number:
+            self._wait_for_continue()
+        else:
+            self._wait(interests, until)
 
     def _wait_for_continue(self) -> None:
         """If the sentence is paused, confirm the pause and wait until it ends.

@@ -137,11 +137,10 @@ class ActiveGoal:
         self.length += len(command.text)
         text = self._remove_markdown(command.text, ended=command.end)
         self.growing_text.append(text, now)
-        self.words.append(text)
+        self.words.text += text
+        self.growing_text.ended = command.end
         if command.broken:
             self.growing_text.drop_incomplete()
-        elif command.end:
-            self.growing_text.end()
 
     def _remove_markdown(self, text: str, *, ended: bool) -> str:
         """Return the newly completed text without Markdown. Plain text is returned unchanged."""

@@ -41,13 +41,10 @@ class WordFinder:
     """
 
     def __init__(self, text: str) -> None:
-        self._text = text
+        #: the text, which may grow at the end
+        self.text = text
         self._end = 0
         self._count = 0
-
-    def append(self, text: str) -> None:
-        """Add text at the end."""
-        self._text += text
 
     def find(self, location: int, length: int) -> tuple[int, int, int] | None:
         """Return the start, end and number of the word at a location, or None if the word isn't new.
@@ -56,12 +53,12 @@ class WordFinder:
         """
         if location < self._end:
             return None
-        reported = self._text[location : location + max(length, 0)]
-        if reported.isspace() and self._text[self._end : location].strip():
+        reported = self.text[location : location + max(length, 0)]
+        if reported.isspace() and self.text[self._end : location].strip():
             # After a full stop, the reported location of the next word is one too low ("I go. this one is"). A blank
             # directly after the previous word isn't a new word. It is reported for the second half of an emoji's name
             # ("smiling face").
-            reported = self._text[location:]
+            reported = self.text[location:]
         start = location + len(reported) - len(reported.lstrip())
         parts = reported.split(maxsplit=1)
         if not parts:
@@ -72,7 +69,7 @@ class WordFinder:
 
     def _whole_end(self, start: int, end: int) -> int:
         """Return the end of a whole word, given the part of it that was reported."""
-        text = self._text
+        text = self.text
         if end == len(text) or text[end].isspace():
             return start + len(text[start:end].rstrip(_END_MARKS) or text[start:end])
         if _LETTER.match(text, end - 1):
