@@ -246,17 +246,17 @@ def test_escaped_characters_do_not_shift_the_highlight() -> None:
 
 @given(text=ODD, start=st.integers(-3, 90), length=st.integers(-3, 30), columns=st.integers(-2, 60))
 def test_the_view_fits_the_terminal_and_is_always_printable(text: str, start: int, length: int, columns: int) -> None:
-    sentence = MeasuredText(text)
-    assert sentence.whole == printable(text)
+    sentence, whole = MeasuredText(text), printable(text)
+    assert sentence.split(len(sentence)) == (whole, "")
     heard, lit, ahead = sentence.view(start, start + length, columns)
     shown = heard + lit + ahead
     assert width(shown) <= max(0, columns)
     assert shown.isprintable() or all(character.isprintable() or character in "\u0301\ufe0f" for character in shown)
-    if width(sentence.whole) <= columns:
-        assert shown == sentence.whole
+    if width(whole) <= columns:
+        assert shown == whole
     elif columns >= 15 and 0 <= start < len(text) and length > 0:
         assert lit
-        assert shown.removeprefix(ELLIPSIS).removesuffix(ELLIPSIS) in sentence.whole
+        assert shown.removeprefix(ELLIPSIS).removesuffix(ELLIPSIS) in whole
 
 
 @given(st.lists(st.text(st.sampled_from("a 日\n\u0301"), max_size=5)))

@@ -154,7 +154,7 @@ class _TerminalFeedback(Feedback):
     def _write_whole(self, line: _GoalLine) -> None:
         """Write a goal's state and its whole sentence."""
         ended = line.state is State.SUCCEEDED
-        heard, unheard = (line.text.whole, "") if ended else line.text.split(line.word[1])
+        heard, unheard = line.text.split(len(line.text) if ended else line.word[1])
         with self._writing:
             state = Screen(colour=True).coloured(f"{line.state.name:<9}", line.state)
             _write(

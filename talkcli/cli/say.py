@@ -127,8 +127,7 @@ def _report_sent(goal: GoalHandle, options: CommonOptions, reporter: GoalReporte
             note("to speak a long text line by line, pipe it into: talk say --lines")
         return code
     reporter.show_accepted(goal)
-    code = reporter.report(goal.goal)
-    return code if goal.state.terminal else EXIT_OK
+    return reporter.report(goal.goal)
 
 
 def _write_wav_file(

@@ -13,7 +13,7 @@ from talkcli.cli.command import is_bad_byte, replace_bad_bytes
 from talkcli.cli.show import retry_without_output, show_if_possible
 from talkcli.cli.stdin import InputSpeaker
 from talkcli.cli.wait import seconds_left, timeout_error
-from talkcli.errors import EXIT_OK, RequestRefused, TalkError
+from talkcli.errors import TalkError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import Say
 from talkcli.goals.states import State
@@ -82,8 +82,7 @@ class StreamSpeaker(InputSpeaker):
             return reporter.wait_for(goal, self._interrupts, self._timeout, self._follow)
         retry_without_output(reporter.show_accepted, goal)
         self._follow(goal)
-        code = retry_without_output(reporter.report, goal.goal)
-        return code if goal.state.terminal else EXIT_OK
+        return retry_without_output(reporter.report, goal.goal)
 
     def _follow(self, goal: GoalHandle) -> None:
         """Send the input as it arrives, until it ends.
@@ -108,7 +107,6 @@ class StreamSpeaker(InputSpeaker):
             if exchange and exchange.over:
                 self._process_answer(exchange)
                 exchange = None
-            goal._lose_if_disconnected()
             self._show_events(goal)
         self._show_events(goal)
 
@@ -133,9 +131,7 @@ class StreamSpeaker(InputSpeaker):
         try:
             self._connection.answer(exchange)
         except TalkError as error:
-            try:
-                self._speech._process_error(error)
-            except RequestRefused:
+            if self._speech._process_error(error):
                 self._feedback.note(error.message)
                 self._speech._break_off()
 

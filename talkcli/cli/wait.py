@@ -10,7 +10,7 @@ import time
 
 from talkcli.cli.interrupts import Interrupts, discard_unread_output
 from talkcli.cli.show import Feedback, retry_without_output, show, show_if_possible, show_json
-from talkcli.errors import EXIT_OK, EXIT_TIMEOUT, ServerUnavailable, TimedOut
+from talkcli.errors import EXIT_OK, ServerUnavailable, TimedOut
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import format_number
 from talkcli.goals.states import State
@@ -94,7 +94,7 @@ class GoalReporter:
     def report(self, goal: Goal, prefix: str = "") -> int:
         """Print a goal as JSON, or the reason why it failed. Return its exit code.
 
-        The exit code of an unfinished goal is 124. `prefix` is put in front of any message.
+        The exit code of an unfinished goal is 0. `prefix` is put in front of any message.
         """
         if self._options.json and not self.feedback.shows_events:
             show_if_possible(show_json, goal.to_json())
@@ -107,7 +107,7 @@ class GoalReporter:
             if goal.state is State.ABORTED and goal.reason not in {"nothing_to_say", "text_stalled", "broken_off"}:
                 words += "; find out why with: talk doctor"
             self.feedback.note(f"{prefix}{words}")
-        return EXIT_TIMEOUT if goal.exit_code is None else goal.exit_code
+        return goal.exit_code or EXIT_OK
 
     def cancel(self, goal: GoalHandle, interrupts: Interrupts) -> None:
         """Cancel a goal, wait briefly for silence, and report how the goal ended.

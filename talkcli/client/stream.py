@@ -99,7 +99,8 @@ class SpeechStream:
             try:
                 connection.request(request, self._add_text)
             except RequestRefused as error:
-                self._process_error(error)
+                if self._process_error(error):
+                    raise
             except (Lost, ServerUnavailable) as error:
                 # Wait until the client has reconnected, or until it gives up and the goal is LOST.
                 connection.wait_until(lambda: self._stopped or connection.absent_since is None, None)
@@ -138,18 +139,15 @@ class SpeechStream:
         with suppress(TalkError):
             self._connection.request(Append(self.goal.id, broken=True))
 
-    def _process_error(self, error: TalkError) -> None:
-        """Record that the goal takes no more text. If the error only concerns the last text, raise it instead.
-
-        Raises:
-            RequestRefused: the error only concerns the last text.
-        """
+    def _process_error(self, error: TalkError) -> bool:
+        """Record that text could not be added. Return whether the goal can still take other text."""
         assert self.goal
         if isinstance(error, RequestRefused) and error.code == "goal_ended":
             self._refused = True
         elif isinstance(error, RequestRefused) and not isinstance(error, UnknownGoal):
             self._text.refused()
-            raise error
+            return True
         else:
             with self._connection.changed:
                 self.goal._mark_lost(f"{error.message}; the sentence may still be spoken")
+        return False

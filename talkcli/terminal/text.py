@@ -218,11 +218,6 @@ class MeasuredText:
         self._shown += added
         self._columns += accumulate(map(width, added), initial=self._columns.pop())
 
-    @property
-    def whole(self) -> str:
-        """The whole text, with invisible characters escaped."""
-        return "".join(self._shown)
-
     def split(self, heard: int) -> tuple[str, str]:
         """Split the escaped text after the first `heard` characters."""
         return self._slice(0, heard), self._slice(heard, len(self._shown))

@@ -185,7 +185,7 @@ class Transcript:
             end = len(text) if waits else _last_sentence_end(text, shown)
             if added := text[shown:end].strip():
                 head = self._head_columns(at, "text", None, event.id, screen)
-                lines.append(fit_row(head, quoted_text(replace(goal, text=added, more=False)), [""], 0, screen))
+                lines.append(fit_row(head, f'"{printable(added)}"', [""], 0, screen))
             self._goals[event.id], self._shown_chars[event.id] = replace(goal, text=text), end
         if waits:
             self._heard.discard(event.id)
