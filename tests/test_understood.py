@@ -55,20 +55,20 @@ def say(talk: Talk, sentence: str, voice: str = REAL_VOICE) -> None:
     assert (done.code, talk.goal(done.id)["voice"]) == (0, voice), done
 
 
-def test_ten_sentences_of_a_neural_voice_are_understood(make_talk: MakeTalk, tmp_path: Path) -> None:
+def test_sentences_of_a_neural_voice_are_understood(make_talk: MakeTalk, tmp_path: Path) -> None:
     real_voice()
     needs_packages(PACKAGE)
     path = tmp_path / "speech.wav"
     env = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
     talk = serve_with_voice(make_talk, REAL_VOICE, "--player", f"file:{path}", sink=None, env=env)
     before, understood = 0, []
-    for sentence in SENTENCES[::2]:
+    for sentence in SENTENCES[::4]:
         say(talk, sentence)
         with wave.open(str(path)) as file:
             samples = np.frombuffer(file.readframes(file.getnframes()), "<i2").astype(np.int16)
         understood.append(recognize(samples[before:], SENTENCES))
         before = len(samples)
-    assert understood == SENTENCES[::2]
+    assert understood == SENTENCES[::4]
 
 
 @pytest.mark.slow  # both voices speak all sentences in real time: a minute and a half

@@ -378,7 +378,7 @@ def test_a_sentence_can_be_paused_and_stopped_during_phonemization(folder: Path,
     with _engine(folder, before=before_call(f"synthesizers.espeak:EspeakPhonemizer.{method}", report)) as engine:
         assert engine.spoken("Go. Go", "g0", voice=VOICE).outcome == protocol.OUTCOME_COMPLETED
         assert engine.errors_line() == method
-        for number in range(1, 5):
+        for number in (1, 2):
             goal = f"g{number}"
             engine.say(text, goal, voice=VOICE)
             assert engine.errors_line() == method

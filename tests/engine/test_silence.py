@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from array import array
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import pytest
@@ -21,8 +22,6 @@ from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-    from tests.engine.programs import Player
 
 TEXT, SECOND = "battery low", "thank you"
 #: Lengths of two lead-ins in milliseconds.
@@ -75,17 +74,24 @@ def test_a_lead_in_delays_the_words_and_is_not_part_of_the_duration(
     assert player.heard.read_bytes() == b"".join(samples)
 
 
-@pytest.mark.parametrize(
-    ("own", "idle_after", "again"),
-    [(None, 0.3, LEAD_IN), (None, 10.0, 0), (OWN, 0.3, OWN), (OWN, 10.0, 0)],
-    ids=["idle", "not idle", "own, idle", "own, not idle"],
-)
-def test_a_lead_in_is_repeated_after_a_pause_if_the_device_was_idle(
-    player: Player, own: int | None, idle_after: float, again: int
-) -> None:
+#: The lead-in of a sentence (None for the server's), the seconds until a device is idle, and the lead-in after a pause.
+REPEATED = [(None, 0.3, LEAD_IN), (None, 10.0, 0), (OWN, 0.3, OWN), (OWN, 10.0, 0)]
+
+
+def test_a_lead_in_is_repeated_after_a_pause_if_the_device_was_idle(tmp_path: Path) -> None:
     """The device counts as idle from the moment at which the paused sentence released it."""
-    before, constants = _idle_after(idle_after), {"RELEASE_DELAY_S": 0.3}
-    with Engine(player.plays(), lead_in=LEAD_IN, limits=constants, before=before, alive_every=SOON) as engine:
+    with ThreadPoolExecutor(len(REPEATED)) as pool:  # most of the time is spent waiting
+        folders = [tmp_path / str(number) for number in range(len(REPEATED))]
+        assert len(list(pool.map(_assert_repeated, folders, REPEATED))) == len(REPEATED)
+
+
+def _assert_repeated(folder: Path, case: tuple[int | None, float, int]) -> None:
+    own, idle_after, again = case
+    folder.mkdir()
+    player, constants = Player(folder), {"RELEASE_DELAY_S": 0.3}
+    with Engine(
+        player.plays(), lead_in=LEAD_IN, limits=constants, before=_idle_after(idle_after), alive_every=SOON
+    ) as engine:
         engine.until(protocol.VoiceList)
         engine.say(TEXT, lead_in=own)
         engine.until_word()
@@ -96,10 +102,10 @@ def test_a_lead_in_is_repeated_after_a_pause_if_the_device_was_idle(
         engine.resume()
         assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
     heard, sentence, first = player.heard.read_bytes(), _sentence(), len(_silence(LEAD_IN if own is None else own))
-    assert heard[size:].startswith(_silence(again))
+    assert heard[size:].startswith(_silence(again)), case
     rest = heard[size + len(_silence(again)) :]
-    assert sentence.endswith(rest)
-    assert heard[first : first + len(sentence) - len(rest)] == sentence[: -len(rest)]
+    assert sentence.endswith(rest), case
+    assert heard[first : first + len(sentence) - len(rest)] == sentence[: -len(rest)], case
 
 
 #: A player that buffers 0.4 s of sound, as a Bluetooth output does, and writes it to a file.
