@@ -18,6 +18,7 @@ from tests.fleet.robot import Robot
 from tests.support.bridge import STOP_LIMIT, Bridge
 from tests.support.mqtt import Listener
 from tests.support.processes import Talk
+from tests.support.resource import Resource
 from tests.support.surroundings import clean_environment, dying_with_parent, short_directory
 
 if TYPE_CHECKING:
@@ -39,9 +40,6 @@ class PresenceListener(Listener):
 
     def __init__(self, broker: Broker) -> None:
         super().__init__(broker, "talk/robot/+/presence")
-
-    def __enter__(self) -> PresenceListener:
-        return self
 
     def await_online(self, names: Iterable[str], within: float = ONLINE_LIMIT_S) -> float:
         """Wait until these robots are online with a server, and return the monotonic time of the last one."""
@@ -133,30 +131,22 @@ def _in_parallel(action: Callable[[Any], Any], items: Collection[Any]) -> list[A
     return [future.result() for future in done]
 
 
-class SimulatedRobots(contextlib.AbstractContextManager["SimulatedRobots"]):
+class SimulatedRobots(Resource):
     """Simulated robots in separate processes (see `tests.tools.simulated`)."""
 
     def __init__(self, broker: Broker, count: int, *, processes: int = 1) -> None:
         self.names = [f"sim-{number + 1:04d}" for number in range(count)]
         self._processes: list[subprocess.Popen[str]] = []
         with contextlib.ExitStack() as stack:
-            self._directory = stack.enter_context(short_directory("sim-"))
+            self.directory = stack.enter_context(short_directory("sim-"))
             stack.callback(self._kill)
             for first, end in pairwise(count * part // processes for part in range(processes + 1)):
                 self._start(["--robots", str(end - first), "--first", str(first + 1), "--broker", broker.url])
             self._stack = stack.pop_all()
 
-    def __exit__(self, *_error: object) -> None:
-        self._stack.close()
-
-    @property
-    def log(self) -> str:
-        with open(f"{self._directory}/log", encoding="utf-8", errors="replace") as file:
-            return file.read()
-
     def spoken(self, goal_id: str) -> dict[str, float]:
         """Return the monotonic time at which each robot started a goal. No robot may have started it twice."""
-        with open(f"{self._directory}/spoken", encoding="utf-8") as file:
+        with open(f"{self.directory}/spoken", encoding="utf-8") as file:
             *lines, _unfinished = file.read().split("\n")
         entries = [entry for entry in map(json.loads, lines) if entry["id"] == goal_id]
         result = {entry["robot"]: entry["at"] for entry in entries}
@@ -198,12 +188,12 @@ class SimulatedRobots(contextlib.AbstractContextManager["SimulatedRobots"]):
             assert text not in self.log, self.log[-2000:]
 
     def _start(self, arguments: Sequence[str]) -> None:
-        command = [sys.executable, "-m", "tests.tools.simulated", *arguments, "--spoken", f"{self._directory}/spoken"]
-        with open(f"{self._directory}/log", "ab") as log:
+        command = [sys.executable, "-m", "tests.tools.simulated", *arguments, "--spoken", f"{self.directory}/spoken"]
+        with open(f"{self.directory}/log", "ab") as log:
             process = subprocess.Popen(
                 dying_with_parent(command),
                 cwd=_ROOT,
-                env=clean_environment(self._directory),
+                env=clean_environment(self.directory),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=log,

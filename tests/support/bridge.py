@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from tests.support.forking import Forked, can_fork
 from tests.support.mqtt import Listener
 from tests.support.processes import Clients, Finished
+from tests.support.resource import Resource
 from tests.support.surroundings import MARK, assert_none_left, clean_environment, dying_with_parent, short_directory
 
 if TYPE_CHECKING:
@@ -29,8 +30,8 @@ ONLINE_LIMIT = 10.0
 STOP_LIMIT = 5.0
 
 
-class Bridge(contextlib.AbstractContextManager["Bridge"]):
-    """A running `talk bridge`, which may not be online before `await_online()`. `close()` and `with` kill it.
+class Bridge(Resource):
+    """A running `talk bridge`, which may not be online before `await_online()`.
 
     `user`, `password` and `cert` are as in `Broker.env`. `observer` is the user with whom the test reads the robot's
     presence. `port` is the port of a proxy in front of the broker.
@@ -61,16 +62,10 @@ class Bridge(contextlib.AbstractContextManager["Bridge"]):
         self._sessions: set[str] = set()
         self._earlier: set[str] = set()
         with contextlib.ExitStack() as stack:
-            self._directory = stack.enter_context(short_directory("bridge-"))
+            self.directory = stack.enter_context(short_directory("bridge-"))
             stack.callback(self._end)
             self.start()
             self._stack = stack.pop_all()
-
-    def __exit__(self, *_error: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        self._stack.close()
 
     @property
     def pid(self) -> int:
@@ -80,15 +75,10 @@ class Bridge(contextlib.AbstractContextManager["Bridge"]):
     def running(self) -> bool:
         return self._process is not None and self._process.poll() is None
 
-    @property
-    def log(self) -> str:
-        with open(f"{self._directory}/log", encoding="utf-8", errors="replace") as file:
-            return file.read()
-
     def start(self) -> None:
         assert not self.running, f"the bridge {self.name} is running already"
         self._earlier = set(self._sessions)
-        with open(f"{self._directory}/log", "ab") as log:
+        with open(f"{self.directory}/log", "ab") as log:
             output = log.fileno()
             if can_fork(self._env):
                 self._process = Forked(self._arguments, self._env, stdout=output, stderr=output)
@@ -166,8 +156,8 @@ class Bridge(contextlib.AbstractContextManager["Bridge"]):
         assert_none_left(self._mark, 1.0)
 
 
-class Desk(Clients, contextlib.AbstractContextManager["Desk"]):
-    """Clients that have a broker, but no server. `close()` and `with` kill those that still run."""
+class Desk(Resource, Clients):
+    """Clients that have a broker, but no server."""
 
     def __init__(
         self,
@@ -188,12 +178,6 @@ class Desk(Clients, contextlib.AbstractContextManager["Desk"]):
             variables = {"TALK_SOCKET": f"{home}/nobody"} | broker.env(user, password, cert) | proxy
             self._env = clean_environment(home, variables | dict(env or {}))
             self._stack = stack.pop_all()
-
-    def __exit__(self, *_error: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        self._stack.close()
 
     @property
     def env(self) -> dict[str, str]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from tests.support.certificates import authority
 from tests.support.ports import HOST, Port
+from tests.support.resource import Resource
 from tests.support.surroundings import (
     clean_environment,
     dying_with_parent,
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 _START = 10.0
 
 
-class Broker(contextlib.AbstractContextManager["Broker"]):
+class Broker(Resource):
     """A running broker that stores nothing on disk. `close()` and `with` end it and remove its directory.
 
     Args:
@@ -80,21 +81,9 @@ class Broker(contextlib.AbstractContextManager["Broker"]):
             self.start()
             self._stack = stack.pop_all()
 
-    def __exit__(self, *_error: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """End the broker and remove its directory. Closing twice is allowed."""
-        self._stack.close()
-
     @property
     def url(self) -> str:
         return self.url_at(self.port)
-
-    @property
-    def log(self) -> str:
-        with open(f"{self.directory}/log", encoding="utf-8", errors="replace") as file:
-            return file.read()
 
     @property
     def pid(self) -> int:

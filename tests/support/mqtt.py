@@ -15,6 +15,7 @@ from urllib.parse import urlsplit
 
 from tests.support.connection import PATIENCE
 from tests.support.processes import Finished
+from tests.support.resource import Resource
 from tests.support.surroundings import clean_environment, dying_with_parent, find_program, needs, needs_packages
 from tests.support.watcher import wait_for_first
 
@@ -53,7 +54,7 @@ class Message:
         return value
 
 
-class Listener(contextlib.AbstractContextManager["Listener"]):
+class Listener(Resource):
     """A connection that keeps all messages of its topics. It never reconnects.
 
     `user`, `password` and `cert` are as in `Broker.env`. The constructor raises ConnectionRefusedError if the broker
@@ -84,12 +85,6 @@ class Listener(contextlib.AbstractContextManager["Listener"]):
                 code = self.subscribe(topic)
                 assert code <= _QOS, f"{topic}: refused with {code:#x}"
             self._stack = stack.pop_all()
-
-    def __exit__(self, *_error: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        self._stack.close()
 
     @property
     def messages(self) -> list[Message]:

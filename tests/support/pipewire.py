@@ -12,6 +12,7 @@ import subprocess
 import time
 from typing import TYPE_CHECKING
 
+from tests.support.resource import Resource
 from tests.support.sink import pactl
 from tests.support.surroundings import clean_environment, dying_with_parent, needs, short_directory, stop_child
 
@@ -24,7 +25,7 @@ PROGRAMS = ("pipewire", "pipewire-pulse", "wireplumber", "dbus-daemon", "pactl")
 _LIMIT_S = 20.0
 
 
-class PipeWire(contextlib.AbstractContextManager["PipeWire"]):
+class PipeWire(Resource):
     """A running PipeWire. `with` ends all its processes and removes its directory."""
 
     def __init__(self) -> None:
@@ -51,9 +52,6 @@ class PipeWire(contextlib.AbstractContextManager["PipeWire"]):
             self._start("pipewire-pulse")
             self._await("a sink", lambda: os.path.exists(self.socket) and self._default() not in {"", "@DEFAULT_SINK@"})
             self._stack = stack.pop_all()
-
-    def __exit__(self, *_error: object) -> None:
-        self._stack.close()
 
     def load(self, name: str) -> str:
         """Add a sink that isn't a dummy, wait until it is the default, and return its module."""
@@ -91,8 +89,7 @@ class PipeWire(contextlib.AbstractContextManager["PipeWire"]):
         end = time.monotonic() + _LIMIT_S
         while not exists():
             if time.monotonic() > end or any(process.poll() is not None for process in self._running.values()):
-                with open(f"{self.directory}/log", encoding="utf-8", errors="replace") as log:
-                    raise AssertionError(f"PipeWire: {name} is missing: {log.read()}")
+                raise AssertionError(f"PipeWire: {name} is missing: {self.log}")
             time.sleep(0.02)  # PipeWire sends no event
 
     def _end(self) -> None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from tests.support.connection import PATIENCE, Message, Wire
 from tests.support.forking import Forked, can_fork
+from tests.support.resource import Resource
 from tests.support.surroundings import MARK, assert_none_left, clean_environment, dying_with_parent, short_directory
 from tests.support.watcher import Watcher
 
@@ -143,7 +144,7 @@ class Clients:
                         pipe.close()
 
 
-class Talk(Clients):
+class Talk(Resource, Clients):
     """A server that is ready, with a watcher that sees all its goals. `stop()` ends it and checks everything.
 
     `unfinished` contains the goals that may have no terminal event at the end. True means all goals.
@@ -197,11 +198,6 @@ class Talk(Clients):
     @property
     def env(self) -> dict[str, str]:
         return self._environment(f"{self._mark}-client")
-
-    @property
-    def log(self) -> str:
-        with open(f"{self.directory}/log", encoding="utf-8", errors="replace") as file:
-            return file.read()
 
     @property
     def running(self) -> bool:
@@ -307,10 +303,6 @@ class Talk(Clients):
         if self._watcher:
             self._watcher.wait_for_end()
             self._watcher.check(self.unfinished)
-
-    def close(self) -> None:
-        """End all processes, and remove the directory."""
-        self._stack.close()
 
     def _environment(self, mark: str) -> dict[str, str]:
         server = {"TALK_SOCKET": self.socket, "SCRIPTED_START_FILE": f"{self.directory}/start", MARK: mark}

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal
 
 from tests.support.connection import PATIENCE
 from tests.support.ports import HOST, Port, bound_socket
+from tests.support.resource import Resource
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
@@ -26,7 +27,7 @@ _PIECE_BYTES = 65536
 _RESET = struct.pack("ii", 1, 0)
 
 
-class Proxy(contextlib.AbstractContextManager["Proxy"]):
+class Proxy(Resource):
     """Forwards connections from its `port` to another port of this machine, in a thread.
 
     When a method returns, its effect is complete.
@@ -50,12 +51,6 @@ class Proxy(contextlib.AbstractContextManager["Proxy"]):
             self.release()
             self.accept()
             self._stack = stack.pop_all()
-
-    def __exit__(self, *_error: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        self._stack.close()
 
     def hold(self, *directions: Direction) -> None:
         """Hold back the data in these directions (default: both), and also the ends of connections."""

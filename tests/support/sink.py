@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from tests.support.espeak import RATE
 from tests.support.recording import Recording
+from tests.support.resource import Resource
 from tests.support.surroundings import clean_environment, dying_with_parent, needs, short_directory, stop_child
 
 if TYPE_CHECKING:
@@ -87,8 +88,8 @@ def _start_pulseaudio(directory: str, env: Mapping[str, str], *modules: str) -> 
         time.sleep(0.01)  # a new socket sends no event
 
 
-class Sink(contextlib.AbstractContextManager["Sink"]):
-    """A running sound server. `close()` and `with` end all its processes and remove its directory."""
+class Sink(Resource):
+    """A running sound server."""
 
     def __init__(self) -> None:
         needs(*PROGRAMS)
@@ -111,13 +112,6 @@ class Sink(contextlib.AbstractContextManager["Sink"]):
             stack.callback(self._end)
             self.start_server()
             self._stack = stack.pop_all()
-
-    def __exit__(self, *_error: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """End the sound server and remove its directory. Closing twice is allowed."""
-        self._stack.close()
 
     @property
     def env(self) -> dict[str, str]:
@@ -299,7 +293,7 @@ class _Monitor:
                 self._changed.notify_all()
 
 
-class DistantSink(contextlib.AbstractContextManager["DistantSink"]):
+class DistantSink(Resource):
     """A second PulseAudio with a tunnel to a sink, which delays the sound by 200 ms, like Bluetooth loudspeakers."""
 
     def __init__(self, sink: Sink) -> None:
@@ -311,6 +305,3 @@ class DistantSink(contextlib.AbstractContextManager["DistantSink"]):
             stack.callback(server.wait)
             stack.callback(server.kill)
             self._stack = stack.pop_all()
-
-    def __exit__(self, *_error: object) -> None:
-        self._stack.close()
