@@ -149,13 +149,6 @@ def test_ctrl_c_while_the_text_is_read_prints_a_newline(scripted: Talk) -> None:
     assert client.returncode == 130
 
 
-def test_the_lead_in_of_a_goal_is_not_part_of_its_duration(make_talk: MakeTalk) -> None:
-    talk = make_talk("--player", "null")
-    goal = json.loads(talk.run("--json", "say", "--wait", "--lead-in", "300", "hi").out.splitlines()[-1])
-    assert goal["state"] == "SUCCEEDED"
-    assert goal["ended_at"] - goal["started_at"] >= goal["duration"] + 0.3
-
-
 def test_say_reports_that_speech_is_paused(scripted: Talk) -> None:
     active = busy(scripted)
     assert scripted.run("pause").code == 0
@@ -255,19 +248,6 @@ def test_output_can_be_standard_output(tmp_path: Path) -> None:
     both = alone("--json", "say", "-o", "-", "x")
     assert (both.code, both.out) == (2, "")
     assert "standard output" in both.err
-
-
-def test_output_accepts_a_text_of_any_length(tmp_path: Path) -> None:
-    text = f"one {' ' * 45_000} two"  # exceeds the limits of a goal in characters and in bytes
-    arguments = ["--json", "say", "-o", str(tmp_path / "x.wav"), "--rate", "450"]
-    with short_directory() as home:
-        by_input = subprocess.run(
-            [*TALK, *arguments, "-"], input=text, env=environment(home), capture_output=True, text=True, check=False
-        )
-    report = json.loads(by_input.stdout)
-    assert (by_input.returncode, report["text"]) == (0, text)
-    with wave.open(str(tmp_path / "x.wav")) as audio:
-        assert audio.getnframes() / audio.getframerate() == pytest.approx(report["seconds"], abs=0.01)
 
 
 def test_the_error_for_a_long_text_suggests_lines(scripted: Talk) -> None:

@@ -25,13 +25,12 @@ from tests.conformance.hearing import (
     await_word,
     heard,
     player_process,
-    render_quick,
     send,
     start_goal,
     start_goal_with_client,
 )
 from tests.conformance.voices import with_both
-from tests.support.compare import assert_heard, assert_only_beginning, assert_silent, compare, loudness
+from tests.support.compare import assert_heard, assert_only_beginning, assert_silent, loudness
 from tests.support.reference import Sentence
 from tests.support.timing import assert_within, limits
 
@@ -179,14 +178,6 @@ def test_a_goal_uses_the_settings_at_its_start_except_its_own(talk: Talk, voice:
     assert loudness(references[1]) < 0.6 * loudness(references[4])
     del references[3]
     assert_heard(heard(talk), references)
-
-
-@pytest.mark.parametrize("voice", ["espeak"], indirect=True)
-def test_a_goals_own_pitch_and_voice_apply_only_to_it(talk: Talk) -> None:
-    await_spoken(talk, send(talk, LOW, pitch=80), send(talk, HOME, voice="de"), send(talk, LOW))
-    own = Sentence(LOW, QUICK, pitch=80)
-    assert_heard(heard(talk), render_quick([own, Sentence(HOME, QUICK, voice="de"), LOW]))
-    assert not compare(render_quick([LOW])[0], render_quick([own])[0]).same
 
 
 @with_both

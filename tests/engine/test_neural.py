@@ -23,10 +23,8 @@ from talkcli import install
 from talkcli.engine import protocol
 from talkcli.install import NEURAL_PACKAGES
 from tests.engine.process import FAST, SOON, Engine, SharedEngine, before_call
-from tests.engine.programs import Player, without_silence
 from tests.support import tiny_voice
 from tests.support.espeak import RATE
-from tests.support.processes import children
 from tests.support.real_voice import REAL_VOICE, real_voice
 from tests.support.surroundings import needs_packages
 from tests.support.timing import assert_within, limits
@@ -403,31 +401,6 @@ def test_a_real_voice_can_be_paused_and_stopped_and_exits_cleanly(real_voice_env
         engine.until(protocol.Word)  # seconds of samples are still being computed, ahead of the playback
         engine.hang_up()
         assert engine.process.wait(20) == 0, engine.errors()
-
-
-def test_a_program_gets_every_sample_once_and_silence_during_a_pause(folder: Path, player: Player) -> None:
-
-    text = "one two three"
-    with _engine(folder, player.plays(), alive_every=SOON) as engine:
-        ended = engine.spoken(text, "g0", voice=VOICE)
-        sentence = player.heard.read_bytes()
-        assert ended.duration is not None
-        assert len(sentence) == round(ended.duration * 22050) * 2
-        player.heard.unlink()
-        engine.say(text, "g1", voice=VOICE)
-        engine.until_word(2)
-        assert engine.pause() < 0.2
-        assert children(engine.process.pid), "the player has ended"
-        for _ in range(5):
-            engine.until(protocol.Alive)
-        engine.resume()
-        ended = engine.until(protocol.Ended)
-        assert ended.outcome == protocol.OUTCOME_COMPLETED
-        assert ended.gap_seconds < 5 * SOON, "the pause was counted as a gap"
-        assert [word.number for word in engine.words()] == [1, 2, 3]
-        heard = player.heard.read_bytes()
-        assert len(heard) > len(sentence)
-        assert without_silence(heard, sentence) == sentence
 
 
 # -- machines that are too slow

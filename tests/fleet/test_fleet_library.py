@@ -95,12 +95,6 @@ def test_cancel_cancels_a_goal_on_all_robots(fleet: Fleet, pair: RealRobots) -> 
     assert pair["wh-1"].talk.goal("before-it")["state"] == "ACTIVE"
 
 
-def test_without_wait_the_outcome_is_the_accepted_goal(fleet: Fleet, pair: RealRobots) -> None:
-    assert results(fleet.say("@all", "hello", wait=False, id="accepted", ttl=0)) == alike("PENDING")
-    assert results(fleet.wait("@all", ["accepted"])) == alike("SUCCEEDED")
-    assert pair["wh-1"].talk.goal("accepted")["ttl"] is None
-
-
 def test_the_goal_of_a_closed_request_is_still_spoken(fleet: Fleet, pair: RealRobots) -> None:
     outcomes = fleet.say("wh-*", "length=0.3 go on", id="left")
     pair.each(lambda robot: robot.talk.watcher.wait_for("left", "ACTIVE"))
