@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.terminal.text import width
-from tests.conformance.bareserve import TALK, run
+from tests.conformance.bareserve import TALK
 from tests.support.processes import Talk
 from tests.support.terminal import Terminal
 
@@ -203,12 +203,6 @@ def test_an_unknown_voice_is_refused_with_a_suggestion(shared: Talk) -> None:
     error = json.loads(shared.run("--json", "set", "--voice", "x\x1b[31my").err)["error"]
     assert (error["code"], error["exit"]) == ("unknown_voice", 2)
     assert "\x1b" not in error["message"]
-    assert settings(shared) == DEFAULTS
-
-
-def test_set_ignores_the_environment_variables_of_serve(shared: Talk) -> None:
-    env = {**shared.env, "TALK_RATE": "100", "TALK_VOLUME": "0.1", "TALK_VOICE": "none"}
-    assert run([*TALK, "set", "--pitch", "50"], env).code == 0
     assert settings(shared) == DEFAULTS
 
 

@@ -279,21 +279,6 @@ def test_the_same_id_and_text_attach_to_the_existing_goal(client: Client, script
     assert len(scripted.watcher.words("door.1")) == 2  # it was spoken once
 
 
-def test_a_patient_goal_waits_for_room_in_the_queue(make_talk: MakeTalk) -> None:
-    talk = make_talk("--max-queue", "1", scripted=True)
-    with Client(talk.socket) as client, Client(talk.socket) as other:
-        active, pending = client.say("never-ends"), client.say("never-ends")
-        refused = client.say("length=0")
-        assert (refused.state, refused.goal.reason) == (State.REJECTED, "queue_full")
-        states: list[State] = []
-        thread = threading.Thread(target=lambda: states.append(client.say("length=0", patient=True).wait(10).state))
-        thread.start()
-        assert active.cancel().state is State.PREEMPTED  # the waiting thread doesn't block the client
-        assert other.cancel([pending.id]).canceled[0].id == pending.id
-        thread.join(10)
-        assert states == [State.SUCCEEDED]
-
-
 def test_a_patient_goal_is_not_spoken_after_its_sender_hangs_up(make_talk: MakeTalk, tmp_path: Path) -> None:
     """The server notices a hang-up the next time it reports that it is alive."""
     talk = make_talk("--max-queue", "1", program=patched_serve(tmp_path, subscribers__CLIENT_ALIVE_INTERVAL_S=0.5))

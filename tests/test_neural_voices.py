@@ -330,14 +330,6 @@ def test_espeak_speaks_if_the_files_of_a_voice_are_missing(env: dict[str, str], 
         assert f'{goal.id} is spoken with the voice {voice} instead: unknown voice "piper/tiny"' in robot.server.log
 
 
-def test_goals_fail_at_once_if_the_engine_cannot_start(env: dict[str, str], tmp_path: Path) -> None:
-    (tmp_path / "site" / "pyttsx3.py").write_text("raise ModuleNotFoundError('no pyttsx3 here', name='pyttsx3')")
-    with _robot(env, "--voice", TINY) as robot:
-        robot.until(lambda: "pyttsx3 is missing" in robot.server.log)
-        goals = [robot.say("a", None), robot.say(voice_only=True), robot.say("behind", "en")]
-        assert [goal.wait(LIMIT).reason for goal in goals] == ["engine_failed"] * 3
-
-
 def test_an_engine_that_hangs_while_loading_is_replaced(env: dict[str, str], hold: Path) -> None:
     with _robot(env) as robot:
         goal = robot.say(voice_only=True)
@@ -498,22 +490,14 @@ def test_a_drivers_voice_precedes_a_neural_voice_of_the_same_name(env: dict[str,
         assert used == ["piper/tiny", "piper/tiny", "gmw/en-US"], "the language of a neural voice selects that voice"
 
 
-def test_an_unknown_voice_or_speaker_is_refused(env: dict[str, str], tmp_path: Path) -> None:
+def test_an_unknown_speaker_is_refused(env: dict[str, str], tmp_path: Path) -> None:
     several = tiny_voice.description(speakers=2)
     tiny_voice.put(tmp_path / "voices", "two", tiny_voice.model(speakers=2), several)
-    with serving(env, *_to_file(env)):
-        for voice, message in (
-            ("piper/tiny#1", 'no speaker "1"; the voice has one speaker'),
-            ("piper/two#2", 'no speaker "2"; the voice has 2 speakers, 0 to 1'),
-            ("piper/two#nobody", 'no speaker "nobody"'),
-        ):
-            done = run([*TALK, "say", "--voice", voice, "a"], env)
-            assert (done.code, message in done.err) == (5, True), done
-        for voice in ("piper/tiny#0", "piper/two#1", "piper/two#p1"):
-            assert heard(env, "--voice-only", "--voice", voice) == voice
-    for voice, message in (("piper/tiny#4", "the voice has one speaker"), ("piper/none", 'unknown voice "piper/none"')):
-        done = run([*TALK, "serve", "--player", "null", "--voice", voice], env)
-        assert (done.code, message in done.err) == (2, True), done
+    with _robot(env) as robot:
+        assert robot.heard(robot.say(voice="piper/two#p1")) == ("SUCCEEDED", "piper/two#p1")
+        refused = robot.say(voice="piper/two#2").goal
+        assert (refused.state.name, refused.reason) == ("REJECTED", "unknown_voice")
+        assert 'no speaker "2"; the voice has 2 speakers, 0 to 1' in str(refused.message)
 
 
 #: System calls that change a file or use the internet, successful or not.

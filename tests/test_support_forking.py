@@ -15,7 +15,6 @@ from tests.support.forking import Forked, can_fork
 from tests.support.surroundings import clean_environment, short_directory
 
 if TYPE_CHECKING:
-    import pathlib
     from collections.abc import Iterator
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="talk is forked only on Linux")
@@ -42,15 +41,6 @@ def run_forked(arguments: list[str], env: dict[str, str], text: str | None = Non
     return process.wait(LIMIT_S), out, err
 
 
-def serving(env: dict[str, str], *, session: bool = False) -> Forked:
-    """Start a server, and return it when it is ready."""
-    arguments = ["serve", "--player", "null"]
-    process = Forked(arguments, env, stderr=subprocess.PIPE, start_new_session=session)
-    assert process.stderr
-    assert any("ready on " in line for line in process.stderr)
-    return process
-
-
 def test_a_forked_command_ends_like_a_started_one(env: dict[str, str]) -> None:
     for arguments, code, out, err in (
         (["--version"], 0, "talk ", ""),
@@ -70,43 +60,6 @@ def test_an_early_signal_is_not_lost(env: dict[str, str]) -> None:
         reading.send_signal(signal.SIGINT)
         assert reading.wait(LIMIT_S) in (130, -signal.SIGINT)
         reading.communicate(timeout=LIMIT_S)
-
-
-def test_a_fatal_signal_gives_a_negative_exit_code(env: dict[str, str]) -> None:
-    number = signal.SIGSEGV
-    with serving(env, session=True) as process:
-        assert process.poll() is None
-        assert os.getsid(process.pid) == process.pid != os.getsid(0)
-        with pytest.raises(subprocess.TimeoutExpired):
-            process.wait(0.01)
-        process.send_signal(number)
-        assert process.wait(LIMIT_S) == -number
-        assert process.poll() == process.returncode == -number
-        process.send_signal(number)  # must not reach another process
-
-
-def test_sigint_and_sigterm_give_the_exit_codes_of_a_shell(env: dict[str, str]) -> None:
-    with serving(env) as server:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            client = piped(["watch"], env)
-            assert client.stdout
-            assert client.stdout.readline()
-            client.send_signal(number)
-            client.communicate(timeout=LIMIT_S)
-            assert client.returncode == 128 + number
-        server.terminate()
-        assert server.wait(LIMIT_S) == 0
-
-
-def test_input_environment_and_directory_can_be_set(env: dict[str, str], tmp_path: pathlib.Path) -> None:
-    assert env["TALK_SOCKET"] in run_forked(["status"], env)[2]
-    assert env["TALK_SOCKET"] not in run_forked(["status"], {**env, "TALK_SOCKET": "/nowhere/else"})[2]
-    for name in ("one", "two"):
-        (tmp_path / name).mkdir()
-        with pytest.MonkeyPatch.context() as patch:
-            patch.chdir(tmp_path / name)
-            assert run_forked(["say", "-o", "here.wav", "-"], env, "grün, 日本\n") == (0, "", "")
-        assert (tmp_path / name / "here.wav").stat().st_size > 1000
 
 
 def test_a_forked_server_dies_with_its_parent(env: dict[str, str]) -> None:

@@ -138,6 +138,18 @@ async def test_a_room_check_asks_once_per_priority() -> None:
 
 
 @in_loop
+async def test_room_is_checked_only_after_the_queue_has_changed() -> None:
+    server, client, checks = Server(), Client(), []
+    server.fill()
+    server.wait(client, "patient")
+    await turn()
+    server.requests._submit_waiting_goals = lambda: checks.append("a check")  # type: ignore[method-assign]
+    server.ask(client, Say("refused"))
+    await turn()
+    assert (client.goals(), checks) == (["refused"], [])
+
+
+@in_loop
 async def test_the_memory_for_all_waiting_requests_is_limited() -> None:
     server, one, other = Server(), Client(), Client()
     server.fill()

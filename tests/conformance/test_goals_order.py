@@ -15,13 +15,9 @@ from tests.conformance.checks import assert_event_order, assert_recalled, assert
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
-    import pathlib
-
     from tests.conftest import MakeTalk
     from tests.support.connection import Message, Wire
     from tests.support.processes import Talk
-
-ROOT = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 
 
 def start_goal(talk: Talk, text: str = "never-ends words=1", **fields: object) -> str:
@@ -116,19 +112,6 @@ def test_a_patient_goal_is_accepted_when_there_is_room(make_talk: MakeTalk) -> N
     assert_event_order(talk)
 
 
-def test_patient_goals_are_spoken_in_the_order_they_were_sent(make_talk: MakeTalk) -> None:
-    talk, active, waiting = start_full_server(make_talk)
-    with talk.connect() as wire:
-        for number in range(5):
-            send_patient(wire, f"line {number}")
-        assert talk.request("cancel", ids=[active])["ok"]
-        results = [wire.receive_event("result")["goal"] for _ in range(5)]
-    assert [goal["state"] for goal in results] == ["SUCCEEDED"] * 5
-    assert [goal["text"] for goal in results] == [f"length=0 line {number}" for number in range(5)]
-    assert spoken_ids(talk) == [active, waiting, *(goal["id"] for goal in results)]
-    assert_event_order(talk)
-
-
 def test_a_later_goal_does_not_take_the_place_of_a_patient_goal(make_talk: MakeTalk) -> None:
     talk, _, waiting = start_full_server(make_talk)
     with talk.connect() as wire:
@@ -210,37 +193,6 @@ def test_all_clients_get_their_results_at_shutdown_even_beyond_the_output_limit(
         assert reasons.result() == ["shutdown"] * count
 
 
-#: Serves with the scripted engine, and logs each check for goals that have room now.
-COUNT_CHECKS = """
-import sys
-sys.path.insert(0, {root!r})
-from talkcli.daemon import log
-from talkcli.server.requests import Requests
-from tests.support import scripted_serve
-check_room = Requests._submit_waiting_goals
-Requests._submit_waiting_goals = lambda self: (log.write("looks for room"), check_room(self))
-scripted_serve.main()
-"""
-
-
-def test_room_is_checked_only_after_the_queue_has_changed(make_talk: MakeTalk, tmp_path: pathlib.Path) -> None:
-    program = tmp_path / "serve.py"
-    program.write_text(COUNT_CHECKS.format(root=ROOT))
-    talk = make_talk("--max-queue", "1", program=str(program))
-    start_goal(talk)
-    queue(talk, 0)
-    with talk.connect() as wire:
-        send_patient(wire, "patient")
-        before = talk.log.count("looks for room")
-        for _ in range(20):
-            assert_rejected(submit(talk, "length=0"), "queue_full")
-        assert talk.log.count("looks for room") == before
-        submit(talk, "length=0", priority=1)
-        assert talk.request("hello")["ok"]
-        assert talk.log.count("looks for room") > before
-        assert talk.request("cancel")["ok"]
-
-
 @pytest.mark.parametrize(
     ("selection", "chosen"),
     [
@@ -277,19 +229,6 @@ def test_a_cancel_ends_the_selected_goals_that_wait_for_room(
         for name in wires.keys() - chosen:
             assert wires[name].receive_event("result")["goal"]["reason"] != "canceled"
     assert_event_order(talk)
-
-
-def test_settings_are_changed_together_or_not_at_all(scripted: Talk) -> None:
-    before = scripted.request("set")["settings"]
-    assert scripted.request("set", rate=300, volume=7)["error"]["code"] == "bad_option"
-    assert scripted.request("set", rate=300, voice="klingon")["error"]["code"] == "unknown_voice"
-    assert scripted.request("set")["settings"] == before
-    after = scripted.request("set", rate=300, preempt=True, ttl=5)["settings"]
-    assert after == {**before, "rate": 300, "preempt": True, "ttl": 5}
-    active = start_goal(scripted)
-    goal = submit(scripted, "length=0 preempts now")
-    assert (goal["ttl"], states(scripted, active)[-1]) == (5, "PREEMPTED")
-    assert scripted.request("set", ttl=0, preempt=False)["settings"]["ttl"] is None
 
 
 def test_subscribers_get_the_words_before_the_result(scripted: Talk) -> None:
