@@ -216,7 +216,7 @@ def voices(options: CommonOptions, incomplete: str) -> Offers:
 
 
 def robots(options: CommonOptions, _: str) -> Offers:
-    """Return the names and groups of the robots that are online as completions."""
+    """Complete the names and groups of online robots."""
     broker = options.broker()
     from talkcli.fleet import topics
     from talkcli.fleet.desk.watch import read_robots

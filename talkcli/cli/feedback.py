@@ -35,7 +35,7 @@ _CLEAR_LINE = "\r\x1b[2K"
 
 
 def make_feedback(options: CommonOptions) -> Feedback:
-    """Create the display that suits the options and standard output."""
+    """Choose a display by the options and the kind of standard output. Return it."""
     if options.json:
         return _JsonFeedback()
     # With other encodings, the displayed width of characters is unknown.

@@ -110,7 +110,7 @@ class MarkdownReader:
         self._in_list = False
         #: whether "**" or a similar mark is open, so that it may be closed within a word
         self._is_strong = False
-        #: the offsets of marks whose beginning was found earlier, with their lengths
+        #: closing marks of spans that have begun: their lengths by offset
         self._closing: dict[int, int] = {}
         #: the last character of the paragraph that was returned and isn't blank
         self._last = ""

@@ -87,13 +87,13 @@ class Configure:
     output_fd: int | None = None
     #: whether a sentence fails if the output is muted; `Speak.audible` takes precedence
     audible: bool = False
-    #: player that worked last time, tried first if `player` is None; None for the default order
+    #: the player to try first if `player` is None. None stands for the default order
     last_player: str | None = None
 
 
 @frozen
 class Speak:
-    """The command to speak a text.
+    """The command that makes the engine speak a text.
 
     Rate, volume and pitch are absolute values, not relative changes.
     """

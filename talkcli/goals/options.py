@@ -513,7 +513,7 @@ OPTIONS = (
         "aborted (`text_stalled`)",
         default=STALL_S,
         limits=(MIN_STALL_S, MAX_STALL_S),
-        help="With --stream, stop if no text arrives for SEC seconds. The time starts when everything was spoken.",
+        help="With --stream, stop if no text arrives for SEC seconds. The time starts when all of the text was spoken.",
     ),
     Option(
         "format",

@@ -324,7 +324,7 @@ class Scheduler:
         return []
 
     def break_off(self, record: Record, now: Now, *, at_once: bool = False) -> list[Effect]:
-        """End a goal whose text is incomplete, at once or after its complete sentences. Return the effects.
+        """End a goal whose text will stay incomplete. Return the effects.
 
         A goal that hasn't started always ends at once.
         """

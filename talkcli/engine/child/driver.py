@@ -286,7 +286,7 @@ class Driver:
             self._speak(text)
 
     def say(self, text: str) -> None:
-        """Store a text for the next step of `iterate` to speak."""
+        """Store a text, which the next step of `iterate` speaks."""
         self._proxy.setBusy(True)
         self._text = text
 

@@ -201,7 +201,7 @@ def _convert_os_error(path: str, error: OSError) -> CannotWrite:
 
 
 def _display_name(path: str) -> str:
-    """Return the name of the output for messages."""
+    """Return the name that messages use for the output."""
     return "standard output" if path in STANDARD_OUTPUT else path
 
 

@@ -222,7 +222,7 @@ class DeskLink:
         return topic(to, topics.REQUEST, self.user), response
 
     def wake(self) -> None:
-        """Make `poll` return soon if another thread is waiting in it."""
+        """Wake up a thread that is waiting in `poll`."""
         # Sending fails if the link is closed, or if the buffer is full because `poll` has already been woken.
         with contextlib.suppress(OSError):
             self._wake_writer.send(b"\0")

@@ -218,7 +218,7 @@ class RobotConnection(Connection):
         self._desk.poll(timeout, self._interrupt if interruptible else None)
 
     def keep_alive(self) -> None:
-        """Send a message to keep the bridge's session alive, if nothing was sent for a while."""
+        """Keep the bridge's session alive by a message if nothing else was sent lately."""
         if time.monotonic() - self._published_at > _KEEP_ALIVE_INTERVAL_S:
             self._send_without_answer(Hello(self._sender))
 
