@@ -205,7 +205,7 @@ def read_value(option: Option, text: str) -> Any:
         return _parse_file_mode(text)
     if kind in (WORD, ID):
         text = _as_utf8(text)
-        bad = next(filter(is_bad_byte, text), None)
+        bad = next(filter(_is_bad_byte, text), None)
         if bad:
             raise ValueError(f"the byte {_format_byte(bad)} is not valid UTF-8")
     if option.choices and text not in option.choices:
@@ -248,7 +248,7 @@ def _as_utf8(text: str) -> str:
     return text.encode(errors="surrogateescape").decode(errors="surrogateescape")
 
 
-def is_bad_byte(character: str) -> bool:
+def _is_bad_byte(character: str) -> bool:
     """Return whether a character is a surrogate that represents an invalid byte."""
     return "\udc80" <= character <= "\udcff"
 
@@ -271,7 +271,7 @@ def replace_bad_bytes(text: str, first_line_number: int = 1) -> tuple[str, str |
     if text.isascii():
         return text, None
     text = _as_utf8(text)
-    found = [place for place, each in enumerate(text) if is_bad_byte(each)]
+    found = [place for place, each in enumerate(text) if _is_bad_byte(each)]
     if not found:
         return text, None
     first = found[0]
@@ -281,7 +281,7 @@ def replace_bad_bytes(text: str, first_line_number: int = 1) -> tuple[str, str |
     if len(found) > 1:
         words += f" ({len(found) - 1:,} more like it)"
     # The engine treats the replacement character U+FFFD as a space.
-    return "".join("\ufffd" if is_bad_byte(each) else each for each in text), words
+    return "".join("\ufffd" if _is_bad_byte(each) else each for each in text), words
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:

@@ -18,7 +18,7 @@ from talkcli.polling import Interrupted, wait_ready
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-    from types import FrameType, TracebackType
+    from types import FrameType
 
 _HANDLED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -92,9 +92,7 @@ class Interrupts:
             signal.pthread_sigmask(signal.SIG_UNBLOCK, self._blocked)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> bool:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> bool:
         for each, handler in self._old_handlers.items():
             signal.signal(each, handler)
         signal.set_wakeup_fd(self._old_wakeup_fd)

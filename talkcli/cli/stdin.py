@@ -259,6 +259,12 @@ class InputSpeaker:
             watched.pop(0, None)
         return None
 
+    def _show_events(self, goal: GoalHandle) -> None:
+        """Show the goal's new events with --wait. Otherwise, forget them."""
+        while event := goal.poll():
+            if self._wait:
+                show_if_possible(self._feedback.show, goal.goal, event)
+
 
 class LineSpeaker(InputSpeaker):
     """Speaks each line of standard input as a goal, for `say --lines`."""
@@ -483,8 +489,7 @@ class LineSpeaker(InputSpeaker):
             return
         while self._goals:
             number, handle = self._goals[0]
-            while event := handle.poll():
-                show_if_possible(self._feedback.show, handle.goal, event)
+            self._show_events(handle)
             if not handle.state.terminal:
                 return
             self._record_failure(number, self._reporter.report(handle.goal))

@@ -9,8 +9,8 @@ from __future__ import annotations
 import codecs
 from functools import partial
 
-from talkcli.cli.command import is_bad_byte, replace_bad_bytes
-from talkcli.cli.show import retry_without_output, show_if_possible
+from talkcli.cli.command import replace_bad_bytes
+from talkcli.cli.show import retry_without_output
 from talkcli.cli.stdin import InputSpeaker
 from talkcli.cli.wait import seconds_left, timeout_error
 from talkcli.errors import TalkError
@@ -45,11 +45,10 @@ class InputDecoder:
         Empty bytes mark the end of the input.
         """
         added = self._decoder.decode(data, final=not data)
-        if not added.isprintable() and any(map(is_bad_byte, added)):
-            if self.problem is None:
-                self.problem = replace_bad_bytes(self._text + self._line_breaks + added)[1]
-            added, _ = replace_bad_bytes(added)
-        found = self._line_breaks + added
+        replaced, problem = replace_bad_bytes(added)
+        if problem and self.problem is None:
+            self.problem = replace_bad_bytes(self._text + self._line_breaks + added)[1]
+        found = self._line_breaks + replaced
         end = len(found.rstrip("\r\n"))
         if data and len(found) - end > _MAX_HELD_LINE_BREAKS:
             end = len(found)
@@ -134,12 +133,6 @@ class StreamSpeaker(InputSpeaker):
             if self._speech._process_error(error):
                 self._feedback.note(error.message)
                 self._speech._break_off()
-
-    def _show_events(self, goal: GoalHandle) -> None:
-        """Show the goal's new events with --wait. Otherwise, forget them."""
-        while event := goal.poll():
-            if self._wait:
-                show_if_possible(self._feedback.show, goal.goal, event)
 
 
 def _has_news(goal: GoalHandle, exchange: Exchange | None) -> bool:

@@ -400,13 +400,11 @@ class Supervisor:
 
         Keep the whole text, because the goal may have to be sent again.
         """
-        goal = self._current_goal(goal_id)
-        if goal is None:
-            return
-        added = text[len(goal.command.text) :]
-        goal.command = replace(goal.command, text=text, more=not complete, broken=broke_off)
-        if goal.sent:
-            self._send(protocol.Append(goal_id, added, complete, broke_off))
+        if goal := self._current_goal(goal_id):
+            added = text[len(goal.command.text) :]
+            goal.command = replace(goal.command, text=text, more=not complete, broken=broke_off)
+            if goal.sent:
+                self._send(protocol.Append(goal_id, added, complete, broke_off))
 
     def _pause_or_resume_goal(self, goal_id: str, number: int | None) -> None:
         """Pause the goal, or resume it if `number` is None."""
