@@ -1,4 +1,4 @@
-"""The output of `talk status`, `talk set` and `talk cancel` for people and scripts."""
+"""The output of `talk status` and `talk set` for people and scripts."""
 
 from __future__ import annotations
 
@@ -214,30 +214,3 @@ def test_serve_starts_with_the_settings_from_its_options(make_talk: MakeTalk) ->
     status = talk.run("status").out
     assert "ttl 0.5 s" in status
     assert "lead-in 250 ms" in status
-
-
-# talk cancel
-
-
-def test_cancel_stops_exactly_the_goals_that_its_selectors_match(scripted: Talk) -> None:
-    active = scripted.run("say", "--key", "battery", "never-ends").id
-    scripted.watcher.wait_for_word(active)
-    keys = ("door", "battery", "lift", "hall")
-    door, battery, lift, hall = (scripted.run("say", "--key", key, "waits").id for key in keys)
-    for key in ("nothing", "batter", "BATTERY", "-"):
-        done = scripted.run("cancel", "--key", key)
-        assert (done.code, done.out, done.err) == (0, "", "")
-    for options in (["--key", ""], ["--before", ""], ["--key="], ["--key", "k" * 65]):
-        done = scripted.run("cancel", *options)
-        assert (done.code, done.out) == (2, "")
-        assert "key" in done.err or "--before" in done.err
-    done = scripted.run("--json", "cancel", "--key", "door", lift)
-    assert {json.loads(line)["id"] for line in done.out.splitlines()} == {door, lift}
-    assert scripted.goal(active)["state"] == "ACTIVE"
-    done = scripted.run("cancel", "--key", "battery")
-    assert (done.code, set(done.out.split()), done.err) == (0, {active, battery}, "")
-    assert (scripted.goal(active)["state"], scripted.goal(battery)["state"]) == ("PREEMPTED", "RECALLED")
-    assert scripted.watcher.wait_for_terminal(hall) == "SUCCEEDED"
-    active = scripted.run("say", "never-ends").id
-    scripted.watcher.wait_for_word(active)
-    assert scripted.run("cancel", "--key", "nothing", "--current").id == active

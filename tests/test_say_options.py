@@ -95,19 +95,6 @@ def test_preempt_queue_flush_and_priority_reach_the_server(make_talk: MakeTalk) 
     assert ends == ["PREEMPTED", "RECALLED", "SUCCEEDED"]
 
 
-def test_expired_and_replaced_goals_exit_with_6(scripted: Talk) -> None:
-    busy(scripted)
-    expired = scripted.run("--json", "say", "--wait", "--ttl", "0.2", "too late")
-    goal = json.loads(expired.out)
-    assert (expired.code, goal["reason"], goal["ttl"]) == (6, "expired", 0.2)
-    older = scripted.start("say", "--wait", "--key", "battery", "battery at 20 %")
-    assert older.stdout
-    assert older.stdout.readline().strip()
-    newer = scripted.run("say", "--key", "battery", "battery at 19 %").id
-    done = scripted.finish(older)
-    assert (done.code, done.out, newer in done.err) == (6, "", True)
-
-
 def test_a_throttled_goal_exits_with_0_and_prints_no_id(scripted: Talk) -> None:
     throttled = ["say", "--key", "battery", "--throttle", "60"]
     assert scripted.run(*throttled, "--wait", "length=0").code == 0

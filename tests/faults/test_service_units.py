@@ -27,6 +27,7 @@ from tests.support.connection import Wire
 from tests.support.processes import children
 from tests.support.surroundings import needs, needs_packages
 from tests.support.timing import assert_within, limits
+from tests.tools.bench.machine import processor_use
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -447,15 +448,6 @@ def test_an_idle_supervised_server_wakes_less_than_once_a_second(home: str) -> N
         env = supervised_env(home, supervisor, WATCHDOG_USEC="30000000")
         with serving(env, command=SCRIPTED) as server:
             supervisor.wait_for("STATUS", "idle; ")
-            before = context_switches(server.process.pid)
+            before = processor_use([server.process.pid]).switches
             time.sleep(4)
-            assert context_switches(server.process.pid) - before < 4
-
-
-def context_switches(pid: int) -> int:
-    """Return the number of context switches of a process's threads."""
-    total = 0
-    for task in os.listdir(f"/proc/{pid}/task"):
-        with open(f"/proc/{pid}/task/{task}/status", encoding="utf-8") as file:
-            total += sum(int(line.split()[1]) for line in file if "ctxt_switches" in line)
-    return total
+            assert processor_use([server.process.pid]).switches - before < 4

@@ -251,7 +251,7 @@ the selectors of a cancel add up
 cancel of a key ends the active and the pending goal
     a key=k; b key=d; c key=k; cancel key=k  ->  a PREEMPTING canceled by door; b PENDING; c RECALLED canceled by door
 cancel of a key that no goal has ends nothing
-    a key=d; b; cancel b key=k  ->  a ACTIVE; b RECALLED canceled by door
+    a key=kk; b key=K; c; cancel c key=k  ->  a ACTIVE; b PENDING; c RECALLED canceled by door
 shutdown ends everything and accepts no goal
     a; b; c; shutdown; shutdown; d; stopped a  ->  a PREEMPTED shutdown; b c RECALLED shutdown; d REJECTED shutdown
 a goal that was cancelled while it waited for room stops nothing
