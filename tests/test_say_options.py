@@ -237,15 +237,6 @@ def test_output_can_be_standard_output(tmp_path: Path) -> None:
     assert "standard output" in both.err
 
 
-def test_the_error_for_a_long_text_suggests_lines(scripted: Talk) -> None:
-    for arguments, typed in ((["-"], "one two. " * 2000), (["-w", "-"], "x" * 50_000), (["-w", "x" * 10_001], None)):
-        done = scripted.run("say", *arguments, stdin=typed)
-        assert (done.code, done.out) == (5, "")
-        assert "10,000" in done.err
-        assert "talk say --lines" in done.err
-    assert scripted.run("-q", "say", "-", stdin="x" * 50_000).err == ""
-
-
 def test_output_prefers_options_to_environment_variables(tmp_path: Path) -> None:
     usual = _seconds_of(tmp_path, "--rate", "200", TALK_RATE="100")
     assert _seconds_of(tmp_path, TALK_RATE="") == pytest.approx(usual, abs=0.1)

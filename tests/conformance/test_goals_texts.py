@@ -92,6 +92,9 @@ def test_the_error_for_an_oversized_input_is_accurate(scripted: Talk) -> None:
         assert (done.code, done.out) == (5, "")
         error = "not spoken: standard input is too long (more than 40,000 bytes; a text has at most 10,000 characters"
         assert error in done.err
+        assert "talk say --lines" in done.err
+    assert "talk say --lines" in scripted.run("say", "-", stdin="one two. " * 2_000).err
+    assert scripted.run("-q", "say", "-", stdin="one two. " * 2_000).err == ""
     done = scripted.run("--json", "say", "-f", "-", stdin="a" * 300_000)
     (event,) = map(json.loads, done.out.splitlines())
     assert (event["event"], event["goal"]["reason"], done.code) == ("result", "text_too_long", 5)
