@@ -18,7 +18,7 @@ from tests.fleet.robot import Robot
 from tests.support.bridge import STOP_LIMIT, Bridge
 from tests.support.mqtt import Listener
 from tests.support.processes import Talk
-from tests.support.resource import Resource
+from tests.support.resources import Resource
 from tests.support.surroundings import clean_environment, dying_with_parent, short_directory
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from tests.support.forking import Forked, can_fork
 from tests.support.mqtt import Listener
 from tests.support.processes import Clients, Finished
-from tests.support.resource import Resource
+from tests.support.resources import Resource
 from tests.support.surroundings import MARK, assert_none_left, clean_environment, dying_with_parent, short_directory
 
 if TYPE_CHECKING:

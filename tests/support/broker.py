@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from tests.support.certificates import authority
 from tests.support.ports import HOST, Port
-from tests.support.resource import Resource
+from tests.support.resources import Resource
 from tests.support.surroundings import (
     clean_environment,
     dying_with_parent,

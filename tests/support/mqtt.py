@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 
 from tests.support.connection import PATIENCE
 from tests.support.processes import Finished
-from tests.support.resource import Resource
+from tests.support.resources import Resource
 from tests.support.surroundings import clean_environment, dying_with_parent, find_program, needs, needs_packages
 from tests.support.watcher import wait_for_first
 

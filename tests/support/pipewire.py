@@ -12,7 +12,7 @@ import subprocess
 import time
 from typing import TYPE_CHECKING
 
-from tests.support.resource import Resource
+from tests.support.resources import Resource
 from tests.support.sink import pactl
 from tests.support.surroundings import clean_environment, dying_with_parent, needs, short_directory, stop_child
 

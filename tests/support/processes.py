@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from tests.support.connection import PATIENCE, Message, Wire
 from tests.support.forking import Forked, can_fork
-from tests.support.resource import Resource
+from tests.support.resources import Resource
 from tests.support.surroundings import MARK, assert_none_left, clean_environment, dying_with_parent, short_directory
 from tests.support.watcher import Watcher
 

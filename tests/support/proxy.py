@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Literal
 
 from tests.support.connection import PATIENCE
 from tests.support.ports import HOST, Port, bound_socket
-from tests.support.resource import Resource
+from tests.support.resources import Resource
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from tests.support.espeak import RATE
 from tests.support.recording import Recording
-from tests.support.resource import Resource
+from tests.support.resources import Resource
 from tests.support.surroundings import clean_environment, dying_with_parent, needs, short_directory, stop_child
 
 if TYPE_CHECKING:
