@@ -187,7 +187,7 @@ class RemoteSessions:
     # -- from the publisher
 
     def handle_goal_change(self, event: StateChanged, boot: str) -> None:
-        """Update the pending goals after the server with this boot id has reported a state change."""
+        """Record the goal's state among the pending goals. Then send or cancel waiting goals."""
         goal = event.goal
         if event.state is not State.PENDING:
             counted = self.goals.remove(event.id)
@@ -207,7 +207,7 @@ class RemoteSessions:
             self.ids.add(goal.id, boot, user)
 
     def reset_pending(self, pending: tuple[Goal, ...], boot: str) -> None:
-        """Replace the recorded pending goals with those that the server has just reported."""
+        """Replace the recorded pending goals with the server's. Then send waiting goals."""
         self.goals.replace_pending((each.id, each.key) for each in pending if self.ids.is_counted(each.id, boot))
         self.handle_pending_change()
 

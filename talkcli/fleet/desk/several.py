@@ -259,7 +259,7 @@ class FleetRequest:
         link.subscribe(topics.robot(topics.ANY, topics.PRESENCE), retained=True)
 
     def on_disconnected(self, why: str) -> None:
-        """Treat all robots as absent, and ignore robots that appear later."""
+        """Treat all robots as absent until they are back. Ignore robots that weren't known before."""
         # Ignore robots that appear after this, because the broker may be back too late.
         self._complete = self._complete or self._began
         for each in self._robots.values():
