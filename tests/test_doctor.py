@@ -18,7 +18,7 @@ import pytest
 
 from talkcli import Client
 from talkcli.doctor import examine, sentence, sound
-from talkcli.doctor.report import next_step
+from talkcli.doctor.report import next_steps
 from talkcli.doctor.voice import SENTENCE_TEXT
 from talkcli.goals.states import State
 from tests.conformance.bareserve import TALK, environment
@@ -330,7 +330,7 @@ def test_hanging_programs_only_delay_the_doctor(home: str, monkeypatch: pytest.M
     started_at = time.monotonic()
     findings = list(examine.LocalExamination(None, silent=False).findings())
     assert time.monotonic() - started_at < LIMIT_S / 2
-    assert next_step(findings)
+    assert next_steps(findings)
     messages = {finding.check: finding.message for finding in findings}
     assert "no answer within 0.3 s" in messages["device"]
     assert "does not answer" in messages["sound server"]

@@ -276,6 +276,7 @@ def test_a_device_is_looked_up_in_its_players_list(tmp_path: Path) -> None:
     finding = sound.check_device(env, "aplay", "robot_speaker")
     assert (finding.state, "robot_speaker is not a device that aplay -L lists" in finding.message) == (WARNING, True)
     assert "plughw:CARD=Device,DEV=0" in finding.message
+    assert str(finding.next).endswith("from this list: aplay -L")
     assert sound.check_device(env, "pacat", None).state == OK, "it is a fault only if a device is given"
     finding = sound.check_device(env, "pacat", "usb")
     assert (finding.state, finding.next) == (WARNING, "sudo apt-get install -y pulseaudio-utils")

@@ -147,7 +147,7 @@ def _report_pause(options: CommonOptions, goal: Goal | None, *, paused: bool, me
 def doctor(options: CommonOptions, silent: bool) -> int:
     """Run the doctor's checks, show the findings and the next step, and return the exit code."""
     from talkcli.cli.interrupts import Interrupts
-    from talkcli.doctor.report import format_conclusion, format_finding, next_step
+    from talkcli.doctor.report import format_conclusion, format_finding, next_steps
     from talkcli.goals.states import EXIT_CODES, State
 
     findings = []
@@ -163,7 +163,7 @@ def doctor(options: CommonOptions, silent: bool) -> int:
     if not options.json and not options.quiet:
         note(format_conclusion(findings, screen(), examination.question))
     # If speech can't be heard, exit with the same code as for an aborted goal.
-    return 0 if next_step(findings) is None else EXIT_CODES[State.ABORTED]
+    return EXIT_CODES[State.ABORTED] if next_steps(findings) else 0
 
 
 def _create_examination(

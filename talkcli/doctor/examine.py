@@ -154,11 +154,11 @@ class LocalExamination:
             used = self._engine.ready.player or used
         used = self._player or used
         yield sound.check_player(env, self._player, used, by_server=by_server)
-        if used in sound.DEVICE_LISTS and not (used == "pulse" and sound_server.hangs):
+        if used in sound.DEVICE_LISTS and (used != "pulse" or sound_server.name is not None):
             yield sound.check_device(env, used, device)
         yield sound.check_cards(cards, sound_server, session)
         yield sound.check_access(sound_server, session)
-        yield sound.judge_sound_server(sound_server, cards, session)
+        yield sound.judge_sound_server(sound_server, cards, session, used)
         yield from sound.check_levels(env, sound_server, cards, in_use=device is None and used in PLAYERS)
 
     def _speak_sentence(self) -> Finding:

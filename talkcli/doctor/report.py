@@ -79,13 +79,17 @@ def join_names(names: Sequence[str]) -> str:
     return ", ".join(names) if hidden <= 1 else f"{', '.join(names[:_SHOWN_NAMES_COUNT])} and {hidden} more"
 
 
-def next_step(findings: Sequence[Finding]) -> str | None:
-    """Return the advice for the first failure, or None if no check failed.
+def next_steps(findings: Sequence[Finding]) -> list[str]:
+    """Return the advice for the first failure, or an empty list if no check failed.
 
     If no check failed, the answer to the question is yes, because every examination ends with a failure or with the
-    check that proves the answer.
+    check that proves the answer. If the advice is to start a server, the advice for the next failure follows, because
+    a new server alone would not be heard.
     """
-    return next((each.next for each in findings if each.state == FAILURE), None)
+    failures = [each for each in findings if each.state == FAILURE]
+    steps = [each.next or "" for each in failures]
+    starts_server = bool(steps) and failures[0].check == "socket" and "talk serve" in steps[0]
+    return steps[: 2 if starts_server else 1]
 
 
 def format_finding(finding: Finding, screen: Screen) -> list[str]:
@@ -106,12 +110,13 @@ def format_finding(finding: Finding, screen: Screen) -> list[str]:
 
 def format_conclusion(findings: Sequence[Finding], screen: Screen, question: Question = SENTENCE_QUESTION) -> str:
     """Format the answer to the question, and the advice if a check failed."""
-    step = next_step(findings)
-    if step is None:
+    steps = next_steps(findings)
+    if not steps:
         warned = sum(each.state == WARNING for each in findings)
         return question.yes + ("" if not warned else "; 1 warning" if warned == 1 else f"; {warned} warnings")
-    steps = _wrap(step, screen.columns_left(len(_FINAL_STEP_INDENT)))
-    return "\n".join([f"{question.no}; do this next:", *(_FINAL_STEP_INDENT + each for each in steps)])
+    room = screen.columns_left(len(_FINAL_STEP_INDENT))
+    wrapped = ["\n".join(_FINAL_STEP_INDENT + each for each in _wrap(step, room)) for step in steps]
+    return f"{question.no}; do this next:\n" + "\nand then:\n".join(wrapped)
 
 
 def _wrap(text: str, room: int | None) -> list[str]:

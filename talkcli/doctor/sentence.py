@@ -9,7 +9,7 @@ import contextlib
 from typing import TYPE_CHECKING
 
 from talkcli.doctor.report import Finding, failure, ok
-from talkcli.doctor.sound import is_custom
+from talkcli.doctor.sound import START_SOUND_SERVER, is_custom
 from talkcli.doctor.voice import INSTALL_LIBRARY, SENTENCE_RATE_WPM, SENTENCE_TEXT, explain_failure, start_engine
 from talkcli.engine import protocol
 from talkcli.engine.parent.process import EngineFailed
@@ -210,7 +210,7 @@ def advise(
     if reason == Reason.AUDIO_DEVICE and ("denied" in said or "not permitted" in said):
         return "give the server's user access: sudo usermod -aG audio USER; then log in again, and restart the server"
     if reason == Reason.NO_PLAYER and player == "pulse":
-        return "start PulseAudio or PipeWire, or use ALSA: talk serve --player aplay"
+        return START_SOUND_SERVER
     if reason == Reason.ENGINE_FAILED and "libespeak-ng is missing" in message:
         return INSTALL_LIBRARY
     if reason in _PLAYER_REASONS and isinstance(player, str) and is_custom(player):

@@ -198,6 +198,10 @@ def _advise_on_missing_server(places: list[SocketPlace], named_by: str | None, e
     for each in paths.client_sockets(None) if named_by else []:
         if _probe_path(each, set()).state == PLACE_LISTENING:
             return f"{_UNNAMING[named_by]}, because a server is running on {each}"
+    caller = paths.sudo_caller_socket()
+    found = None if caller is None else _probe_path(caller, {caller})
+    if found and found.state == PLACE_LISTENING and found not in places:
+        return f"use the server of the user who called sudo: talk --socket {caller} doctor"
     place = next((each for state in _PLACE_ADVICE for each in places if each.state == state), None)
     if place is None:  # a new server could start at any of the places
         # Only root can see the sockets of all users.

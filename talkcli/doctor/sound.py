@@ -52,6 +52,8 @@ _NOT_DEVICES = frozenset(
     {"null", "lavrate", "samplerate", "speexrate", "jack", "oss", "speex", "upmix", "vdownmix", "usbstream"}
 )
 _SOUND_SERVER_CHECK, _LOUDNESS_CHECK = "sound server", "loudness"
+#: Advice if the player needs a sound server and none is running.
+START_SOUND_SERVER = "start PulseAudio or PipeWire, or use ALSA: talk serve --player aplay"
 #: A sentence may be inaudible across a room if the volume is lower than this.
 _FAINT_PERCENT = 20
 #: The names of ALSA's mixer controls for loudspeakers.
@@ -541,14 +543,14 @@ def check_device(env: Mapping[str, str], player: str, configured: str | None) ->
     if configured is None or configured in names or ":" in configured:
         return ok("device", f"{used}; {command} lists {join_names(names)}")
     words = f"{configured} is not a device that {command} lists: {join_names(names)}"
-    return warning("device", words, "restart the server with --device and one of these names")
+    return warning("device", words, f"restart the server with --device and a name from this list: {command}")
 
 
 def check_cards(cards: Sequence[str], sound_server: SoundServer, session: UserSession) -> Finding:
     """Return the finding on whether the kernel has found any sound cards."""
     if cards:
         return ok("cards", join_names(cards))
-    if sound_server.name is not None:
+    if sound_server.name is not None and sound_server.default_sink != DUMMY_SINK:
         return ok("cards", "this machine has no sound card, but the sound server has an output")
     if _CONTAINER in session.origins:
         step = "start the container with --device /dev/snd, or with the sound server's socket (see the README)"
@@ -583,8 +585,13 @@ def check_access(sound_server: SoundServer, session: UserSession, directory: str
     return warning("group", words, f"sudo usermod -aG {group} {session.user}, and log in again")
 
 
-def judge_sound_server(server: SoundServer, cards: Sequence[str], session: UserSession) -> Finding:
-    """Return the finding about the sound server."""
+def judge_sound_server(
+    server: SoundServer, cards: Sequence[str], session: UserSession, player: str | None = None
+) -> Finding:
+    """Return the finding about the sound server.
+
+    Without one, it is a warning if `player` needs a sound server.
+    """
     check = _SOUND_SERVER_CHECK
     where = "from here" if session.server_pid is None else f"from the server (process {session.server_pid})"
     if server.name is not None and server.default_sink == DUMMY_SINK:
@@ -598,8 +605,10 @@ def judge_sound_server(server: SoundServer, cards: Sequence[str], session: UserS
     if not server.sockets and server.pulse_server is None:
         if session.origins and not cards:
             return _judge_unreachable(server, session, f"no sound server can be reached {where}")
-        alone = "; players use ALSA" if cards else ""
-        return ok(check, f"no PulseAudio or PipeWire is running for user {session.user}{alone}")
+        words = f"no PulseAudio or PipeWire is running for user {session.user}"
+        if player in DEVICE_LISTS and player != "aplay":
+            return warning(check, f"{words}, but the player {player} needs one", START_SOUND_SERVER)
+        return ok(check, words + ("; players use ALSA" if cards else ""))
     at = f"{server.pulse_server} (PULSE_SERVER)" if server.pulse_server else join_names(server.sockets)
     if server.error is None:
         step = "sudo apt-get install -y pulseaudio-utils"

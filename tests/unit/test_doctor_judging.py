@@ -11,7 +11,7 @@ import pytest
 from talkcli import __version__, paths
 from talkcli.doctor import report, sentence, server, sound, voice
 from talkcli.doctor.examine import LocalExamination
-from talkcli.doctor.report import FAILURE, OK, WARNING, Finding, failure, next_step, ok, warning
+from talkcli.doctor.report import FAILURE, OK, WARNING, Finding, failure, next_steps, ok, warning
 from talkcli.doctor.sentence import SentenceResult, find_playback_step
 from talkcli.doctor.server import SocketPlace
 from talkcli.doctor.sound import SoundServer, UserSession
@@ -51,9 +51,14 @@ def test_the_next_step_is_taken_from_the_first_failure() -> None:
     played, group = ok("sentence", "played"), warning("group", "not in audio", "usermod")
     lost = failure("socket", "no server", "talk serve")
     stuck = failure("sentence", "ABORTED", "look at the loudspeaker")
-    assert next_step([ok("python", "3"), group, stuck]) == "look at the loudspeaker"
-    assert next_step([group, lost, stuck]) == "talk serve"
-    assert next_step([group, played]) is None
+    muted = failure("loudness", "muted", "unmute")
+    assert next_steps([ok("python", "3"), group, stuck]) == ["look at the loudspeaker"]
+    assert next_steps([muted, lost, played]) == next_steps([muted, lost, stuck]) == ["unmute"]
+    assert next_steps([group, lost, stuck]) == ["talk serve", "look at the loudspeaker"]
+    assert next_steps([failure("socket", "found elsewhere", "unset TALK_SOCKET"), stuck]) == ["unset TALK_SOCKET"]
+    assert next_steps([group, played]) == []
+    conclusion = report.format_conclusion([lost, stuck], Screen())
+    assert conclusion.endswith("do this next:\n  talk serve\nand then:\n  look at the loudspeaker")
 
 
 def step_after(reason: str, message: str, player: str | None = None, earlier: str | None = None) -> str:
@@ -240,7 +245,7 @@ def test_a_working_engine_is_reported_with_its_version_and_voices() -> None:
 def test_a_missing_library_is_fixed_before_a_silent_player() -> None:
     for engine in (ENGINE, EngineReport(reason="engine_failed", message=MISSING)):
         judged = voice.judge_engine("2.99", engine, server_engine=MISSING)
-        assert next_step([*judged, sound.judge_silent_player("null", set_by_server=True)]) == voice.INSTALL_LIBRARY
+        assert next_steps([*judged, sound.judge_silent_player("null", set_by_server=True)]) == [voice.INSTALL_LIBRARY]
 
 
 PATH = "/run/user/1000/talk/talk.sock"
@@ -275,6 +280,16 @@ def test_a_missing_server_is_explained_by_the_state_of_its_socket(
     assert judgement.state == FAILURE
     assert message in judgement.message
     assert step in str(judgement.next)
+
+
+def test_root_is_advised_to_use_the_server_of_the_user_who_called_sudo(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = SocketPlace(PATH, server.PLACE_LISTENING, 1000, 7)
+    monkeypatch.setattr(paths, "sudo_caller_socket", lambda: PATH)
+    monkeypatch.setattr(server, "_probe_path", lambda *_: found)
+    for place in (SocketPlace("/a", PLACE_ABSENT), replace(found, state=server.PLACE_FOREIGN)):
+        step = server.explain_missing_server([place], None, NONE).next
+        assert step == f"use the server of the user who called sudo: talk --socket {PATH} doctor"
+    assert "--max-clients" in str(server.explain_missing_server([found], None, FULL).next)
 
 
 def test_another_users_socket_before_the_servers_one_is_a_warning() -> None:
@@ -456,12 +471,25 @@ def test_the_engine_process_or_else_the_sound_server_determines_the_player(
     assert first(PULSE, "aplay", by_server=True) == "pulse", "the server has another engine"
 
 
+def test_a_player_that_needs_a_sound_server_is_warned_about_if_none_is_running(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sound, "on_path", lambda *_: False)
+    monkeypatch.setattr(sound, "find_cards", tuple)
+    monkeypatch.setattr(sound, "find_sound_server", lambda *_: SoundServer())
+    examination = LocalExamination(None, silent=True)
+    for player, state in (("pulse", WARNING), ("aplay", OK)):
+        examination._server = {"player": player, "device": "usb"}
+        findings = list(examination._check_sound())
+        assert find(findings, "sound server").state == state
+        assert (find_playback_step(findings) == sound.START_SOUND_SERVER) == (state == WARNING)
+
+
 def test_a_sound_server_with_only_a_dummy_output_is_a_warning() -> None:
     finding = judged_server(replace(PULSE, default_sink=DUMMY_SINK))
     assert (finding.state, finding.next) == (
         WARNING, "connect a loudspeaker, and check that it is listed: pactl list short sinks"
     )  # fmt: skip
     assert "has only the dummy output auto_null, which nobody can hear" in finding.message
+    assert sound.check_cards((), replace(PULSE, default_sink=DUMMY_SINK), PI).state == WARNING
 
 
 def test_a_missing_player_is_reported_with_its_package() -> None:
