@@ -70,6 +70,14 @@ def describe_place(path: str, error: OSError) -> str:
     return error.strerror or str(error)
 
 
+def closed_directory(path: str) -> str | None:
+    """Return the first directory on the way to a path that this user can't enter, or None."""
+    from pathlib import Path  # rarely needed, and slow to import
+
+    directories = reversed(Path(os.path.abspath(path)).parents)
+    return next((str(each) for each in directories if not os.access(each, os.X_OK)), None)
+
+
 def _runtime_directories(uid: int) -> list[str]:
     """Return the directories that platformdirs may use if XDG_RUNTIME_DIR isn't set."""
     if sys.platform == "darwin":

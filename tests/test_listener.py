@@ -159,6 +159,10 @@ def test_a_refused_client_of_another_user_exits_with_10(home: str) -> None:
             assert "Traceback" not in done.err
             assert "ask its owner to run: talk serve --socket-mode 0660" in done.err
             assert done.err.endswith("or start your own server with: talk serve\n")
+        os.mkdir(f"{home}/closed", 0o700)
+        done = run([*client, "--socket", f"{home}/closed/s", "status"], other_user)
+        assert f"  {home}/closed/s: permission denied; you can't enter {home}/closed\n" in done.err
+        assert "ask its owner to run: talk serve --socket PATH --socket-mode 0660" in done.err
         done = run([*client, "status"], {**other_user, "TALK_SOCKET": path})
         assert done.err.endswith("or unset TALK_SOCKET to try the usual places\n")
         assert "talk serve\n" not in done.err, "a new server would use the same path"

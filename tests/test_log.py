@@ -56,12 +56,12 @@ def test_a_line_shows_time_state_text_sender_and_reason(scripted: Talk, history:
     assert re.search(r'"length=0" +"patrol\\x1b\[m"$', lines[0])
     assert re.search(r" +audio_lost: no cable$", lines[1])
     assert re.search(r'"" .* +invalid_text: the text is empty$', lines[2])
-    assert re.search(r'"waits" .* +canceled by \S+$', lines[3])
+    assert re.search(r'"waits" .* +cancelled by \S+$', lines[3])
     long = scripted.run("log", "--long").out.splitlines()
     assert [line.split()[2] for line in long] == history
     assert re.search(rf'"length=0" +"patrol\\x1b\[m" \(\S*{script}.*, pid \d+\)  0\.0 s$', long[0])
     assert re.search(r", pid \d+ +audio_lost: no cable$", long[1])
-    assert re.search(rf'"waits" .*, pid \d+ +canceled by \S*{script}.*, pid \d+$', long[3])
+    assert re.search(rf'"waits" .*, pid \d+ +cancelled by \S*{script}.*, pid \d+$', long[3])
     assert f'"never-ends {LONG}"' in lines[4]  # a pipe gets the whole text
     assert "\x1b" not in done.out
     goals = [json.loads(line) for line in scripted.run("--json", "log").out.splitlines()]

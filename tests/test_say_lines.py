@@ -312,7 +312,7 @@ def test_a_signal_cancels_only_the_clients_own_goals(make_talk: MakeTalk, number
     code, out, err = typing.end(number)
     assert time.monotonic() - started_at < 3
     assert (code, out) == (128 + number, [])
-    assert f"talk: {ids[0]}: Talk preempted" in err
+    assert f"talk: {ids[0]}: Talk preempted: the goal was cancelled\n" in err
     assert "removed 2 waiting lines from the queue" in err
     assert [talk.watcher.wait_for_terminal(goal_id) for goal_id in ids] == ["PREEMPTED", "RECALLED", "RECALLED"]
     assert talk.watcher.wait_for_terminal(other) == "SUCCEEDED"

@@ -65,7 +65,7 @@ def test_in_a_pipe_every_event_is_printed_at_once_as_a_full_line(scripted: Talk)
     scripted.watcher.wait_for_word(goal_id)
     scripted.run("cancel", goal_id)
     watch.next("PREEMPTING")
-    assert re.search(rf'PREEMPTED   {goal_id} +"{LONG}"  canceled by .*, pid \d+$', watch.next("PREEMPTED"))
+    assert re.search(rf'PREEMPTED   {goal_id} +"{LONG}"  cancelled by .*, pid \d+$', watch.next("PREEMPTED"))
     assert watch.end() == 130
     assert not any("\x1b" in line or "never-ends  " in line or " word " in line for line in watch.lines)
 
@@ -82,7 +82,7 @@ def test_watch_starts_with_the_current_goals(scripted: Talk) -> None:
     ] * 3
     assert ["PENDING" in watch.lines[2], '"waits"' in watch.lines[2], len(watch.lines)] == [True, True, 3]
     scripted.run("cancel")
-    assert re.search(r'"never-ends" +canceled by ', watch.next("PREEMPTED"))
+    assert re.search(r'"never-ends" +cancelled by ', watch.next("PREEMPTED"))
     assert watch.end() == 130
 
 
@@ -161,7 +161,7 @@ def test_a_server_that_goes_away_is_reported(scripted: Talk) -> None:
     watch.next("ACTIVE")
     scripted.watcher.wait_for_word(goal_id)
     scripted.stop()
-    assert watch.next("PREEMPTED").endswith("  shutdown")
+    assert watch.next("PREEMPTED").endswith("  shutdown: the server was stopped")
     done = scripted.finish(watch.process)
     assert (done.code, done.out, "connection to the server was lost" in done.err) == (12, "", True), done
 

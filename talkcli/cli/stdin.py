@@ -525,7 +525,7 @@ class LineSpeaker(InputSpeaker):
             if self._feedback.shows_events:
                 retry_without_output(self._feedback.show, goal, Result(goal))
             elif self._options.json or goal.state is not State.RECALLED:
-                retry_without_output(self._reporter.report, goal)
+                retry_without_output(self._reporter.report, goal, "", True)
         recalled = sum(each.state is State.RECALLED for each in ended)
         if recalled and not (self._feedback.shows_events or self._options.json or self._options.quiet):
             note(f"removed {recalled} waiting line{'s' * (recalled > 1)} from the queue")

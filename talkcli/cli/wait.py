@@ -91,10 +91,11 @@ class GoalReporter:
             show_if_possible(self.feedback.show, goal, Result(goal))
         return self.report(goal, prefix)
 
-    def report(self, goal: Goal, prefix: str = "") -> int:
+    def report(self, goal: Goal, prefix: str = "", own_cancel: bool = False) -> int:
         """Print a goal as JSON, or the reason why it failed. Return its exit code.
 
-        The exit code of an unfinished goal is 0. `prefix` is put in front of any message.
+        The exit code of an unfinished goal is 0. `prefix` is put in front of any message. If this command has cancelled
+        the goal (`own_cancel`), the message doesn't name it.
         """
         if self._options.json and not self.feedback.shows_events:
             show_if_possible(show_json, goal.to_json())
@@ -102,7 +103,7 @@ class GoalReporter:
         if goal.state.terminal and (muted or goal.state is not State.SUCCEEDED) and not self._options.quiet:
             from talkcli.terminal.goals import describe_end
 
-            words = describe_end(goal)
+            words = describe_end(goal, name_client=not own_cancel)
             # The doctor can't find out why the text is unsuitable or incomplete.
             if goal.state is State.ABORTED and goal.reason not in {"nothing_to_say", "text_stalled", "broken_off"}:
                 words += "; find out why with: talk doctor"
@@ -128,7 +129,7 @@ class GoalReporter:
             problem += f": {error or 'interrupted'}"
         if problem:
             retry_without_output(self.feedback.note, f"goal {goal.id} {problem}")
-        retry_without_output(self.report, goal.goal)
+        retry_without_output(self.report, goal.goal, "", True)
 
     def wait_for(self, goal: GoalHandle, interrupts: Interrupts, timeout: float | None, follow: Follow) -> int:
         """Wait until a goal has ended, or cancel it on an interrupt. Return the exit code.

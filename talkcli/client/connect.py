@@ -41,7 +41,8 @@ ANSWER_LIMIT_S = 5.0
 RETRY_PAUSE_S = (0.02, 0.2)
 #: Advice for users who can't connect to a server.
 _START_STEP = "start one with: talk serve"
-_LET_IN_STEP = "ask its owner to run: talk serve --socket-mode 0660 (this admits the socket's group)"
+_LET_IN_STEP = "ask its owner to run: talk serve --socket-mode 0660, and to add you to the socket's group"
+_MOVE_STEP = "ask its owner to run: talk serve --socket PATH --socket-mode 0660, with a PATH that you can reach"
 _START_OWN_STEP = "or start your own server with: talk serve"
 
 
@@ -303,33 +304,38 @@ def unreachable_error(attempt: ConnectionAttempt, named_path: str | None) -> Tal
         return ServerUnavailable(f"the server at {path} doesn't accept connections; restart it if it hangs")
     tried = ""
     found = ""  # description of the last place
-    denied = False
+    advice = ""  # how to get access to the last place that refused this user
     for path, error in attempt.failures:
         words = str(error)
         if isinstance(error, OSError):
             words = found = paths.describe_place(path, error)
             if found == paths.PLACE_DIRECTORY:
                 words += f"; use {_socket_inside(path)}"
-        denied = denied or isinstance(error, AccessDenied) or found == paths.PLACE_FORBIDDEN
+            elif found == paths.PLACE_FORBIDDEN:
+                closed = paths.closed_directory(path)
+                words += f"; you can't enter {closed}" if closed else ""
+                advice = _MOVE_STEP if closed else _LET_IN_STEP
+        else:
+            advice = _LET_IN_STEP
         tried += f"  {path}: {words}\n"
-    step = f"{_LET_IN_STEP}\n{_START_OWN_STEP}" if denied else _START_STEP
+    step = f"{advice}\n{_START_OWN_STEP}" if advice else _START_STEP
     if named_path:
-        step = _advice_for_named_socket(named_path, found, denied=denied)
+        step = _advice_for_named_socket(named_path, found, advice)
     hint = paths.sudo_caller_socket()
     if hint and not os.environ.get("TALK_SOCKET") and hint not in dict(attempt.failures):
         step += f"\nto use the server of the user who called sudo, run: talk --socket {hint}"
-    if denied:
+    if advice:
         return AccessDenied(f"no server that you may use; tried:\n{tried}{step}")
     return ServerUnavailable(f"no server found; tried:\n{tried}{step}")
 
 
-def _advice_for_named_socket(named_path: str, found: str, *, denied: bool) -> str:
+def _advice_for_named_socket(named_path: str, found: str, access_advice: str) -> str:
     """Return advice for a user who named a socket with an option or a variable.
 
     Args:
         named_path: the path as the user named it.
         found: what is there, as described by `paths.describe_place`.
-        denied: whether the server there refuses this user.
+        access_advice: how to get access, or an empty text if this user isn't refused.
     """
     import shlex  # rarely needed, and slow to import
 
@@ -337,8 +343,8 @@ def _advice_for_named_socket(named_path: str, found: str, *, denied: bool) -> st
 
     by_variable = named_path == os.environ.get("TALK_SOCKET")
     place = shlex.quote(printable(_socket_inside(named_path) if found == paths.PLACE_DIRECTORY else named_path))
-    if denied:
-        step = _LET_IN_STEP if by_variable else f"{_LET_IN_STEP}\n{_START_OWN_STEP}"
+    if access_advice:
+        step = access_advice if by_variable else f"{access_advice}\n{_START_OWN_STEP}"
     elif found == paths.PLACE_FILE:
         step = "set TALK_SOCKET to a socket" if by_variable else "choose a socket, or leave out --socket"
     elif by_variable:

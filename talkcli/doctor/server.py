@@ -44,6 +44,8 @@ _ENGINE_START_LIMIT_S, _ENGINE_POLL_S = 1.0, 0.05
 PLACE_FOREIGN = "another user's server"
 PLACE_LISTENING = "a process is listening"
 PLACE_STOPPED = "a stopped process is listening"
+#: Description of a path in a directory that this user can't enter.
+PLACE_CLOSED = "permission denied for a directory of this path"
 #: Advice if the server refuses the client, by error code.
 _REFUSAL_ADVICE = {
     "protocol_mismatch": "install the same version of talk for the server and its clients, and restart the server",
@@ -54,6 +56,8 @@ _REFUSAL_ADVICE = {
 _PLACE_ADVICE = {
     PLACE_FORBIDDEN: "ask {whose} for access: talk serve --socket-mode 0660, and join the socket's group; "
     "or start your own server",
+    PLACE_CLOSED: "ask {whose} for access: talk serve --socket PATH --socket-mode 0660, with a PATH that you can "
+    "reach; or start your own server",
     PLACE_FOREIGN: "remove {path}, and run: talk serve; or if you trust uid {uid}, run: talk --socket {path} doctor",
     PLACE_STOPPED: "continue the process: kill -CONT {pid}",
     PLACE_LISTENING: "restart the server on {path}; if the socket isn't talk's, remove it",
@@ -122,7 +126,9 @@ def _probe_path(path: str, trusted_paths: Container[str | None]) -> SocketPlace:
             uid = file_owner(os.path.dirname(path)) if uid is None else uid
             if isinstance(error, BlockingIOError):  # the server's backlog is full
                 return SocketPlace(path, PLACE_LISTENING, uid)
-            return SocketPlace(path, paths.describe_place(path, error), uid)
+            state = paths.describe_place(path, error)
+            closed = state == PLACE_FORBIDDEN and paths.closed_directory(path)
+            return SocketPlace(path, PLACE_CLOSED if closed else state, uid)
         pid, uid = peers.credentials(probe)
     if path not in trusted_paths and uid not in {os.getuid(), 0}:
         return SocketPlace(path, PLACE_FOREIGN, uid, pid)

@@ -112,7 +112,7 @@ class Fleet:
     ) -> FleetRequest:
         """Cancel some or all goals on each robot. Return the request.
 
-        The request yields the outcomes. By default, all goals are canceled. The other arguments are those of
+        The request yields the outcomes. By default, all goals are cancelled. The other arguments are those of
         `Client.cancel`. The outcome of a robot arrives when the robot is silent.
         """
         return self._send_request(to, Cancel(None if ids is None else tuple(ids), current, before, key))

@@ -389,7 +389,7 @@ class LinkOpener:
                 self.link.close()
 
     def _open(self) -> None:
-        """Open the link, and store any error. Then call `on_done`, or close the link if opening was canceled."""
+        """Open the link, and store any error. Then call `on_done`, or close the link if opening was cancelled."""
         try:
             self.link.open()
         except TalkError as error:

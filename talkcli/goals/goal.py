@@ -19,9 +19,9 @@ JsonObject = dict[str, object]
 
 #: Largest accepted time, about 30 million years.
 _MAX_TIME_S = 1e15
-#: Prefixes of messages that only repeat the goal's state. Prefixes with "Talk" come from older servers.
+#: Prefixes of messages that only repeat the goal's state. The prefixes in the last line come from older servers.
 _STATE_PREFIXES = (
-    *("not spoken", "speech failed", "result unknown"),
+    *("not spoken", "speech failed", "result unknown", "Talk preempted"),
     *("Talk rejected", "Talk recalled", "Talk aborted", "Talk lost"),
 )
 
@@ -197,7 +197,7 @@ def read_fields(data_class: type, message: object) -> dict[str, Any]:
 def message_details(message: str | None) -> str:
     """Return a goal's message without a prefix such as "speech failed: "."""
     head, _, details = (message or "").partition(": ")
-    return details if head in _STATE_PREFIXES else message or ""
+    return details if details and head in _STATE_PREFIXES else message or ""
 
 
 def _create_reader(kind: type) -> Callable[[object], object]:

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from talkcli.goals.options import Append, Cancel, Say, Set
 
 _BROKEN_OFF = "the text broke off before its end"
+#: Why a goal was stopped, if neither another goal nor its ttl ended it.
+_STOP_CAUSES = {Reason.CANCELED: "the goal was cancelled", Reason.SHUTDOWN: "the server was stopped"}
 #: Time limit for the engine to become silent after a stop. Every cancel must be answered within 2 s.
 CONFIRM_SILENCE_S = 1.9
 
@@ -222,7 +224,7 @@ class Scheduler:
         expired = expires_at <= now.monotonic
         recalled = self._find_room(say)
         if recalled is None and not (by or refused or expired):
-            refused = Reason.QUEUE_FULL, f"the queue is full ({len(self.pending)} goals)"
+            refused = Reason.QUEUE_FULL, f"the queue is full ({len(self.pending)} goals); cancel some, or use --key"
         if refused:
             record.reason, words = refused
             record.state, record.message, record.ended_at = State.REJECTED, f"not spoken: {words}", now.wall
@@ -523,7 +525,10 @@ class Scheduler:
             stalled = f"no more text arrived for {options.format_number(record.say.stall)} s"
             words = f"speech failed: {stalled if record.reason is Reason.TEXT_STALLED else _BROKEN_OFF}"
             return self._end(record, State.ABORTED, record.reason, words, None, now)
-        return self._end(record, State.PREEMPTED, record.reason, "Talk preempted", record.by, now)
+        goal = record.by and record.by.goal
+        why = _STOP_CAUSES.get(record.reason or Reason.EXPIRED) or _expiry_message(record)
+        why = f"interrupted by goal {goal}" if goal else why
+        return self._end(record, State.PREEMPTED, record.reason, f"Talk preempted: {why}", record.by, now)
 
     def voice_load_ended(self, voice: str, error: str | None, now: Now, *, has_libraries: bool) -> list[Effect]:
         """Record that a voice was loaded or failed to load. Return the effects.

@@ -74,10 +74,14 @@ _ASSIGNMENT = re.compile(r"\w+=.*")
 _DESCRIPTOR_PATH = re.compile(r"/dev/(fd/\d+|stdin)|/proc/(self|\d+)/fd/\d+")
 
 
-def describe_end(goal: Goal) -> str:
-    """Return a one-line description of how a goal ended."""
+def describe_end(goal: Goal, name_client: bool = True) -> str:
+    """Return a one-line description of how a goal ended.
+
+    If `name_client` is false, it doesn't name the client that cancelled the goal.
+    """
     words = printable(goal.message or goal.state.name)
-    if goal.by and f"by goal {goal.by.goal}" not in words:  # the message may already name the goal
+    by_goal = goal.by and goal.by.goal
+    if goal.by and (f"by goal {by_goal}" not in words if by_goal else name_client):  # the message may name the goal
         words += f" ({_describe_cause(goal.by)})"
     return f"{printable(goal.id)}: {words}" if goal.id else words
 
@@ -304,7 +308,7 @@ def reason_forms(goal: Goal, screen: Screen) -> list[str]:
     """Return descriptions of why a goal ended, longest first. If it succeeded, return its duration."""
     if goal.state is State.SUCCEEDED:
         return [", ".join([*([] if goal.duration is None else [f"{goal.duration:.1f} s"]), *_muted_note(goal)])]
-    reason = printable(goal.reason or goal.state.name.lower())
+    reason = "cancelled" if goal.reason == "canceled" else printable(goal.reason or goal.state.name.lower())
     by = []
     if goal.by is not None:
         by = [screen.goal_id(goal.by.goal)] if goal.by.goal is not None else sender_forms(goal.by.client, screen)

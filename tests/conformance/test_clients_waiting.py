@@ -178,7 +178,8 @@ def test_row_33_ctrl_c_cancels_only_the_clients_own_goal(scripted: Talk, command
         assert scripted.goal(goal_id)["state"] == "ACTIVE"
         return
     assert states(scripted, goal_id)[-2:] == ["PREEMPTING", "PREEMPTED"]
-    assert (done.id, "Talk preempted" in done.err) == (goal_id, True)
+    message = f"talk: {goal_id}: Talk preempted: the goal was cancelled\n"
+    assert (done.id, done.err) == (goal_id, message)
 
 
 @limits()

@@ -191,7 +191,7 @@ def test_row_03_the_cancel_command_returns_after_the_sound_has_stopped(talk: Tal
     assert_only_beginning(samples, voice.render([LONG])[0])
     assert talk.watcher.states(goal) == STOPPED
     ended = talk.goal(goal)
-    assert (ended["reason"], ended["message"]) == ("canceled", "Talk preempted")
+    assert (ended["reason"], ended["message"]) == ("canceled", "Talk preempted: the goal was cancelled")
     assert LONG.startswith(ended["spoken"])
     assert "two" in ended["spoken"] != LONG
 
@@ -240,7 +240,7 @@ def test_row_24_a_preempting_goal_is_heard_after_the_old_one_is_silent(
     second = talk.run("say", "--wait", "--", LOW)
     preempted = talk.finish(first)
     assert (preempted.code, preempted.id) == (7, goal)
-    assert "Talk preempted" in preempted.err
+    assert preempted.err == f"talk: {goal}: Talk preempted: interrupted by goal {second.id}\n"
     assert (second.code, second.err) == (0, "")
     assert talk.watcher.states(goal) == STOPPED
     assert talk.watcher.states(second.id) == SPOKEN

@@ -325,7 +325,7 @@ def test_row_42_a_stopped_goal_reports_the_words_that_were_heard(make_talk: Make
         await_word(talk, goal_id, 5)
         assert talk.request("cancel", ids=[goal_id])["ok"]
         goal = talk.goal(goal_id)
-        assert (goal["state"], goal["message"]) == ("PREEMPTED", "Talk preempted")
+        assert (goal["state"], goal["message"]) == ("PREEMPTED", "Talk preempted: the goal was cancelled")
         last = talk.watcher.words(goal_id)[-1]
         assert last["number"] >= 5
         assert goal["spoken"] == LONG[: last["end"]]

@@ -172,7 +172,7 @@ def test_watch_prints_each_event_with_its_robot(robot: Robot, desk: Desk) -> Non
         ["anna", "PREEMPTED", "b-2"],
     ]
     assert '"battery low"' in lines[0]
-    assert "canceled by" in lines[-1]
+    assert "cancelled by" in lines[-1]
     assert (watching.end().code, watching.process.stderr and watching.process.stderr.closed) == (130, True)
 
 

@@ -112,7 +112,8 @@ def _set_up_child(request: dict[str, Any], descriptors: list[int], parent: int) 
     sys.stdin, sys.stdout = _stream(0, "r", "surrogateescape"), _stream(1, "w", "surrogateescape")
     sys.stderr = _stream(2, "w", "backslashreplace")
     sys.stderr.reconfigure(line_buffering=True)
-    sys.argv = ["talk", *request["arguments"]]
+    # As `python -m talkcli` sets it, because `talk` alone may be another installation on the PATH.
+    sys.argv = [f"{talkcli.__path__[0]}/__main__.py", *request["arguments"]]
     if request["scripted"]:
         scripted_serve.replace_engine()
 

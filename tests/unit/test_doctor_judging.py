@@ -259,6 +259,7 @@ OTHER_SOCKET = "/run/user/7/talk/talk.sock"
     ("place", "named_by", "error", "others", "message", "step"),
     [
         (SocketPlace(PATH, PLACE_FORBIDDEN, 7), None, NONE, [], "permission denied (uid 7)", "ask uid 7 for access"),
+        (SocketPlace(PATH, server.PLACE_CLOSED), None, NONE, [], "for a directory", "talk serve --socket PATH"),
         (SocketPlace(PATH, PLACE_ABSENT), "--socket", NONE, [], "--socket names", "leave out --socket, or"),
         (SocketPlace(PATH, server.PLACE_LISTENING), None, NO_ANSWER, [], "it does not answer", "restart"),
         (SocketPlace(PATH, server.PLACE_LISTENING), None, FULL, [], "too many", "--max-clients"),

@@ -21,7 +21,9 @@ MESSAGES = {
     "a; failed a": "speech failed: device is gone",
     "lost; a; missing": "speech failed: no memory",
     "a; cancel a; wait 2": "speech failed: the goal was stopped, but silence was not confirmed within 1.9 s",
-    "a; cancel a; stopped a": "Talk preempted",
+    "a; cancel a; stopped a": "Talk preempted: the goal was cancelled",
+    "a ttl=1; lost; wait 1; stopped a": "Talk preempted: its ttl of 1 s was over",
+    "a; shutdown; stopped a": "Talk preempted: the server was stopped",
     "a; b; cancel b": "not spoken: the goal was cancelled before it started",
     "a canceled": "not spoken: the goal was cancelled before it started",
     "cancel mine; a id=mine": "not spoken: the goal was cancelled before it arrived",
@@ -31,7 +33,7 @@ MESSAGES = {
     "shutdown; a": "not spoken: the server is stopping",
     "a text=": "not spoken: the text is empty",
     "a fault=unknown_voice": "not spoken: it can't be had",
-    "room 1; a; b; c": "not spoken: the queue is full (1 goals)",
+    "room 1; a; b; c": "not spoken: the queue is full (1 goals); cancel some, or use --key",
     "a id=mine; b id=mine": "not spoken: the id mine was already used for another text",
     "a; b text=a throttle=60": "not spoken: the same text is being spoken",
     "a key=k; b key=k throttle=60": "not spoken: a goal with this key is being spoken",
@@ -170,7 +172,8 @@ def test_the_snapshot_of_a_pending_goal_has_no_later_values() -> None:
     robot.scheduler.output_changed("4k7f-1", Output("pulse", "card", 0.5, False))
     robot.play("cancel; failed a")
     now = robot.goals["a"].snapshot()
-    assert (now.voice, now.reason, now.message, now.duration) == ("gmw/en-US", "canceled", "Talk preempted", 1.5)
+    assert (now.voice, now.reason, now.duration) == ("gmw/en-US", "canceled", 1.5)
+    assert now.message == "Talk preempted: the goal was cancelled"
     goal = robot.goals["a"].snapshot(State.PENDING)
     assert (goal.voice, goal.reason, goal.by, goal.message, goal.spoken) == (None,) * 5
     assert (goal.started_at, goal.ended_at, goal.duration, goal.output) == (None,) * 4

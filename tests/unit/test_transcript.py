@@ -323,12 +323,14 @@ def test_the_reason_for_the_end_of_a_goal_is_shown() -> None:
         return reason_forms(goal, Screen())
 
     assert why(State.SUCCEEDED) == ["2.0 s"]
-    assert why(State.PREEMPTED, "preempted", By("4k7f-8"), "Talk preempted")[0] == "preempted by 4k7f-8"
-    canceled = why(State.PREEMPTED, "canceled", By(client=PATROL), "Talk preempted")
-    assert canceled[-2:] == ['canceled by "night watch"', 'by "night watch"']
+    assert why(State.PREEMPTED, "preempted", By("4k7f-8"), "Talk preempted: by goal 4k7f-8")[0] == "preempted by 4k7f-8"
+    canceled = why(State.PREEMPTED, "canceled", By(client=PATROL), "Talk preempted: the goal was cancelled")
+    assert canceled[-2:] == ['cancelled by "night watch"', 'by "night watch"']
     expired = why(State.RECALLED, "expired", None, "not spoken: its time was over")
     assert expired == ["expired: its time was over", "expired"]
     assert why(State.ABORTED, "audio_device", None, "speech failed: no: device") == ["audio_device: no: device"]
+    assert why(State.PREEMPTED, "shutdown", None, "Talk preempted: the server was stopped")[1] == "shutdown"
+    assert why(State.PREEMPTED, "shutdown", None, "Talk preempted") == ["shutdown", "shutdown"]  # from an older server
     older_server = why(State.ABORTED, "audio_device", None, "Talk aborted: no: device")
     assert older_server == ["audio_device: no: device"]
     throttled = why(State.REJECTED, "throttled", By("4k7f-1"), "not spoken: the same text")

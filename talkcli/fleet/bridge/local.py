@@ -99,7 +99,7 @@ class LocalConnection(ClientCore):
     def close(self) -> None:
         """Close the connection.
 
-        A waiting `read` must first be canceled, or ended with `abort`. The server cancels the requests that it has not
+        A waiting `read` must first be cancelled, or ended with `abort`. The server cancels the requests that it has not
         answered, if possible.
         """
         if self._socket.fileno() >= 0:

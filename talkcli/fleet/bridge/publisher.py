@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 EVENT_EXPIRY_S = 60
 #: Minimum time between two status messages.
 _STATUS_EVERY_S = 1.0
-#: Delay between a change and the status message about it. A canceled goal takes a few milliseconds to end. Without the
+#: Delay between a change and the status message about it. A cancelled goal takes a few milliseconds to end. Without the
 #: delay, the status would show the goal as active for another second.
 _STATUS_AFTER_CHANGE_S = 0.1
 #: Maximum length of a goal's text in the status. Longer texts are cut off.

@@ -93,7 +93,7 @@ class RemoteSessions:
         self._loop = asyncio.get_running_loop()
         self._sessions: dict[tuple[str, str | None], RemoteSession] = {}
         self._release_handle: asyncio.Handle | None = None
-        #: the client that canceled pending goals after the last run of `_send_or_cancel_waiting`, or None
+        #: the client that cancelled pending goals after the last run of `_send_or_cancel_waiting`, or None
         self._canceled_by: By | None = None
 
     # -- from the broker
@@ -174,11 +174,11 @@ class RemoteSessions:
             self._release_handle = self._loop.call_soon(self._send_or_cancel_waiting)
 
     def _send_or_cancel_waiting(self) -> None:
-        """Send waiting goals while there is room, or cancel them if a client canceled all goals."""
+        """Send waiting goals while there is room, or cancel them if a client cancelled all goals."""
         self._release_handle = None
         canceled_by, self._canceled_by = self._canceled_by, None
         if canceled_by and not self.goals.pending_count:
-            # A client has canceled every pending goal, so cancel the waiting goals, too.
+            # A client has cancelled every pending goal, so cancel the waiting goals, too.
             self.cancel_waiting(Cancel(), canceled_by)
         while self.waiting and self.goals.has_room(self.waiting[0][1]):
             request, say, session = self.waiting.pop(0)
@@ -524,7 +524,7 @@ class RemoteSession:
             state: the goal's end state.
             reason: the machine-readable reason for the end.
             message: the human-readable reason for the end.
-            by: the client that canceled the goal, or None.
+            by: the client that cancelled the goal, or None.
         """
         goal_id, sender, now = say.id or self._new_goal_id(), Sender(name=policy.sender_name(self._user)), time.time()
         goal = Goal(goal_id, state, say.text, reason, by, message, client=sender, queued_at=now, ended_at=now)

@@ -120,7 +120,7 @@ class RobotConnection(Connection):
         self.absent_since = self._published_at
         #: the class of the error to raise while the robot is absent
         self._absence_error: type[ServerUnavailable] = ServerUnavailable
-        #: the ids of canceled goals, which are canceled again after each absence
+        #: the ids of cancelled goals, which are cancelled again after each absence
         self._canceled: set[str] = set()
         #: queued lookups of goals, which are sent when earlier ones have been answered
         self._lookups: deque[Exchange] = deque()

@@ -98,7 +98,7 @@ class FleetRequest:
         #: whether all robots are known. Robots that appear later are ignored.
         self._complete = False
         self._closed = False
-        #: the id of the goal that `cancel` has canceled, or None if `cancel` hasn't been called
+        #: the id of the goal that `cancel` has cancelled, or None if `cancel` hasn't been called
         self._canceled_id: str | None = None
         self._desk = DeskLink(broker)
         self._desk.handler = self
@@ -417,7 +417,7 @@ class RobotRequest:
             self._record(*reply_outcomes(self._name, request, reply, items))
 
     def _on_failure(self, error: TalkError) -> None:
-        """Record the failure of the request, after the outcomes of goals that it has canceled."""
+        """Record the failure of the request, after the outcomes of goals that it has cancelled."""
         try:
             items = error.items if isinstance(error, UnknownGoal) else []
             self._record(*outcomes_of_cancel(self._name, items, last=False))
