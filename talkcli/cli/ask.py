@@ -62,7 +62,10 @@ def status(options: CommonOptions, goal_id: str | None, long: bool) -> None:
 
 
 def watch(options: CommonOptions, words: bool, long: bool) -> int:
-    """Show the events of all goals, with each word if `words`, until interrupted. Return the exit code."""
+    """Show the events of all goals until interrupted. Show each word, too, if `words` is true.
+
+    Return the exit code.
+    """
     from talkcli.cli.interrupts import Interrupts, has_reader
     from talkcli.terminal.transcript import Transcript
 
