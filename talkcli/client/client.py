@@ -131,7 +131,7 @@ class Client:
         patient: bool = False,
         block: bool = True,
     ) -> GoalHandle:
-        """Send a goal, and return its handle.
+        """Send a goal. Return its handle.
 
         With `block`, wait until the server has accepted or REJECTED it.
 
@@ -244,7 +244,7 @@ class Client:
         return SpeechStream(self._connection, say)
 
     def follow(self, ids: Iterable[str] | None = None, *, feedback: bool = False) -> list[GoalHandle]:
-        """Start to receive the events of goals. Return the goals' handles.
+        """Subscribe to the events of goals. Return the goals' handles.
 
         Any client may have sent the goals.
 
@@ -276,7 +276,7 @@ class Client:
         before: str | None = None,
         key: str | None = None,
     ) -> Canceled:
-        """Cancel goals. Return them once they are silent.
+        """Cancel goals, and wait until they have stopped. Return the result.
 
         Without arguments, cancel all goals. A goal is cancelled if any of the arguments selects it.
 
@@ -363,7 +363,7 @@ class Client:
         preempt: bool | None = None,
         ttl: float | None = None,
     ) -> JsonObject:
-        """Change the server's settings, and return all settings.
+        """Change the server's settings. Return all settings.
 
         The new settings apply to goals that have not begun to be spoken. They last until the server ends. The units are
         those of `say`.
@@ -387,7 +387,7 @@ class Client:
         return settings if isinstance(settings, dict) else {}
 
     def pause(self) -> Goal | None:
-        """Pause all speech. Return the paused goal, if any, once it is silent.
+        """Pause all speech, and wait until it has stopped. Return the paused goal, if any.
 
         Return None if no goal was being spoken. Nothing is spoken until any client calls `resume`. Pausing twice is no
         error.
@@ -428,7 +428,7 @@ class Client:
     # -- internal
 
     def _create_handle(self, request: Say) -> tuple[GoalHandle, OnReply]:
-        """Check a new goal. Return its handle, and the function that processes the reply.
+        """Check a new goal. Return its handle and a function for the server's reply.
 
         If the text is too long for a request, the goal is already REJECTED.
 
@@ -446,7 +446,7 @@ class Client:
         return handle, accepted
 
     def _full_id(self, goal_id: str) -> str:
-        """Check a goal id, and add the boot id if only a number is given. Return the full id.
+        """Check a goal id, and add the boot id if it is missing. Return the full id.
 
         Raises the same errors as `check_id`.
         """
@@ -456,7 +456,7 @@ class Client:
         return goal_id
 
     def _take_all(self, buffer: EventBuffer) -> Iterator[Event]:
-        """Yield the events of a buffer as they arrive. Raise Lost when no more can arrive."""
+        """Yield a buffer's events as they arrive. Raise Lost when the stream of events ends."""
         for event in take_repeatedly(self._connection, lambda: buffer.take() or buffer.closed, None):
             if event is None or isinstance(event, str):
                 break
@@ -512,7 +512,7 @@ def check(request: Say | Set) -> None:
 
 
 def too_long(request: Say) -> Goal | None:
-    """Return a REJECTED goal if the text is too long for a request, or None if it fits.
+    """Return a REJECTED goal if a text is too long for a request. Otherwise, return None.
 
     Raises:
         UsageError: `data` has no JSON form.

@@ -1,4 +1,4 @@
-"""Connect a client to the server, and explain failures.
+"""Connect a client to the server. Give advice if this fails.
 
 Connecting has two stages. In the first stage, `reach` opens a connection. A caller that already knows its request sends
 it with `send_early`, so that the server works on it while the rest of the client is imported. This stage imports next
@@ -67,19 +67,17 @@ class ConnectionAttempt:
 
     @property
     def backlog_full(self) -> bool:
-        """Whether the server can't accept a connection now, because its backlog is full."""
+        """Whether the connection failed because the server's backlog is full."""
         return self.socket is None and bool(self.failures) and isinstance(self.failures[-1][1], BlockingIOError)
 
 
 def reach(
     named_path: str | None, failures: tuple[tuple[str, Exception], ...] = (), only_path: str | None = None
 ) -> ConnectionAttempt:
-    """Connect to the first usable socket without sending anything. Return the attempt.
+    """Connect to `named_path` or, without one, to the first usual path that works. Return the attempt.
 
-    Args:
-        named_path: path of the only socket to try, as the user named it; None for the usual places.
-        failures: the places that have already been tried, with their errors. They are skipped.
-        only_path: the only one of the usual places to try; None for all of them.
+    `failures` are the paths that have already failed, with their errors. They are skipped. If `only_path` is given, it
+    is the only path to try. Nothing is sent.
     """
     for path in [only_path] if only_path else paths.client_sockets(named_path)[len(failures) :]:
         connected = _socket.socket(_socket.AF_UNIX, _socket.SOCK_STREAM)
@@ -109,7 +107,7 @@ def _check_owner(connected: _socket.socket) -> None:
 def send_early(
     attempt: ConnectionAttempt, hello: JsonObject, request: JsonObject, before_request: Callable[[], None]
 ) -> ConnectionAttempt | None:
-    """Send hello, and the first request if the greeting arrives soon. Return the attempt.
+    """Send the hello message, and try to send the first request early. Return the attempt.
 
     The request is not sent if the greeting is late or unexpected, or if the server may lack a feature.
 
@@ -146,7 +144,7 @@ def send_early(
 
 
 def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> None:
-    """Sleep for a moment, so that the server can use the processor.
+    """Sleep briefly to leave the processor to the server.
 
     Return early if the goal will not be spoken. A client that only waits for the end of its goal calls this before its
     other imports. The server, the engine, the player and the sound server need the processor until the first sound.
@@ -172,7 +170,7 @@ def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> None:
 
 
 def sender_name(name: str | None) -> str | None:
-    """Return the given name, or else the value of TALK_NAME, or else None."""
+    """Return the given name, or the value of TALK_NAME by default."""
     # Cancelling must work even if the variable is not valid UTF-8.
     variable = os.environ.get("TALK_NAME", "").encode(errors="surrogateescape").decode(errors="replace")
     return name or variable or None

@@ -41,7 +41,7 @@ _RECONNECT_PAUSE_S = 0.1
 
 
 def checked_sender_name(name: str | None) -> str | None:
-    """Return the given name, or else TALK_NAME, or else None. Raise UsageError if the name is too long."""
+    """Return the given name, or the value of TALK_NAME by default. Raise UsageError if it is too long."""
     name = sender_name(name)
     if name and len(name) > MAX_SENDER_NAME_CHARS:
         raise UsageError(f"the sender's name is too long: {len(name)} characters (at most {MAX_SENDER_NAME_CHARS})")
@@ -49,7 +49,7 @@ def checked_sender_name(name: str | None) -> str | None:
 
 
 def take_repeatedly(connection: Connection, take: Callable[[], _T], deadline: float | None) -> Iterator[_T]:
-    """Call `take` repeatedly, and yield its results. Wait for the server while there are none.
+    """Call `take` in a loop and yield its results. Wait for the server when there are none.
 
     An empty result is yielded if `deadline` has passed or the connection has ended. Nothing more is received after
     `deadline`, so that a loop over the results ends even if the server keeps sending events.
@@ -259,7 +259,7 @@ class Connection(ClientCore):
             self.wait_until(lambda: False, time.monotonic(), interruptible=False)
 
     def _cut_off(self) -> None:
-        """Break the connection, because a line was sent only in part.
+        """Break a connection on which only part of a line was sent.
 
         The caller must hold the lock `changed`.
         """
@@ -268,7 +268,7 @@ class Connection(ClientCore):
     # -- methods that each transport implements. Callers of `_send` and `_hang_up` hold the lock `changed`.
 
     def _send(self, exchange: Exchange) -> None:
-        """Send or queue the request of a registered exchange.
+        """Send an exchange's request, or queue it for later.
 
         Raises:
             ServerUnavailable: nothing can be sent.
@@ -286,11 +286,11 @@ class Connection(ClientCore):
         raise NotImplementedError
 
     def _hang_up(self) -> None:
-        """Disconnect, which also wakes the reading thread."""
+        """Disconnect, and wake the reading thread."""
         raise NotImplementedError
 
     def _drop(self) -> None:
-        """Close this process's copies of the descriptors.
+        """Close the descriptors in this process.
 
         A parent process keeps its own copies.
         """
@@ -359,7 +359,7 @@ class SocketConnection(Connection):
         self._flush()
 
     def _flush(self) -> None:
-        """Send as many bytes as the server accepts now.
+        """Send queued bytes until the socket is full.
 
         The caller must hold the lock `changed`.
         """
@@ -432,7 +432,7 @@ class ReconnectingConnection(SocketConnection):
     ) -> None:
         """Connect to a server. The arguments are those of `SocketConnection`."""
         super().__init__(socket, name=name, patience_s=patience_s)
-        #: monotonic time of the next attempt to connect. During an attempt, this is the time limit for the greeting.
+        #: monotonic time of the next attempt to connect. During an attempt, the greeting must arrive by this time.
         self._due = 0.0
 
     def begin(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> Exchange:

@@ -119,7 +119,7 @@ class EventListeners:
         self.watches: WeakSet[EventBuffer] = WeakSet()
 
     def add(self, tracked: TrackedGoal) -> None:
-        """From now on, pass a goal's events and all pauses to `tracked`.
+        """Start passing a goal's events and all pauses to `tracked`.
 
         This ends when the goal has ended or is lost.
         """
@@ -127,7 +127,7 @@ class EventListeners:
 
     @property
     def goals(self) -> dict[str, bool]:
-        """The ids of the followed goals, and whether their words are needed."""
+        """The ids of the followed goals, with True for goals whose words are needed."""
         return {goal_id: any(each._with_feedback for each in some) for goal_id, some in self._goals.items()}
 
     @property
@@ -183,7 +183,7 @@ class EventListeners:
 
 
 class TrackedGoal:
-    """What a client knows about a goal, and a buffer for the goal's events."""
+    """A client's record of a goal, with a buffer for the goal's events."""
 
     def __init__(self, goal: Goal) -> None:
         #: the goal's last known state
@@ -214,7 +214,7 @@ class TrackedGoal:
         self._adds_text = self.goal.more
 
     def _listen_to(self, listeners: EventListeners, *, feedback: bool, now: float) -> None:
-        """Register for the goal's events, which the server sends from now on."""
+        """Register with `listeners` to receive the goal's events."""
         self._with_feedback = self._with_feedback or feedback
         if self._followed_at is None:
             self._followed_at = now
@@ -276,7 +276,7 @@ class TrackedGoal:
                 self._buffer.add(event)
 
     def _has_event(self) -> bool:
-        """Return whether `_take` would return an event."""
+        """Return whether there is an event to take."""
         return self.goal.state.terminal or bool(self._buffer)
 
     def _take(self) -> Event | None:
@@ -286,7 +286,10 @@ class TrackedGoal:
 
 @frozen
 class ServerInfo:
-    """A server's description of itself, as sent in its greeting or published by its robot."""
+    """A server's description of itself, such as its version and features.
+
+    It is sent in the server's greeting, and published by the server's robot.
+    """
 
     boot: str = ""
     pid: int | None = None
@@ -326,7 +329,7 @@ class Exchange:
     """A client's request and the server's answer to it."""
 
     def __init__(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> None:
-        """Create an exchange, which must be registered before the request is sent.
+        """Create an exchange. Register it before sending its request.
 
         Args:
             request: the request.
@@ -338,7 +341,7 @@ class Exchange:
         self.on_reply, self.on_failure = on_reply, on_failure
         #: the `seq` of the request and its answer, or 0 before registration
         self.number = 0
-        #: whether the whole request was sent, so that the server may carry it out
+        #: whether the whole request was sent. If so, the server may carry it out.
         self.sent = False
         #: the list items that have been received
         self.items: list[JsonObject] = []
@@ -350,7 +353,7 @@ class Exchange:
 
     @property
     def unlimited(self) -> bool:
-        """Whether there is no time limit for the answer."""
+        """Whether the client waits for the answer without a time limit."""
         request = self.request
         if isinstance(request, Append):
             return not request.broken
@@ -383,7 +386,7 @@ class ClientCore:
         self.ended: str | None = None
         #: the unanswered exchanges, by the `seq` of their requests
         self.exchanges: dict[int, Exchange] = {}
-        #: whether the server has sent its greeting, so that requests may be sent
+        #: whether the server's greeting has arrived. Requests may be sent only after that.
         self.greeted = True
         #: monotonic time at which the connection broke, or None while there is a connection
         self.absent_since: float | None = None
@@ -427,7 +430,7 @@ class ClientCore:
         return request_line({"seq": exchange.number, **request_to_json(exchange.request)})
 
     def queue(self, line: bytes, exchange: Exchange) -> None:
-        """Queue an exchange's line for sending.
+        """Queue the line that contains an exchange's request.
 
         Raises:
             ServerUnavailable: nothing more can be sent.
@@ -549,7 +552,7 @@ class ClientCore:
     # -- time limits
 
     def answer_deadline(self, exchange: Exchange) -> float:
-        """Return the time at which an exchange without progress fails.
+        """Return the time at which an exchange fails if nothing happens.
 
         The request must be sent, or the next line of its answer must arrive, by this time.
         """
@@ -559,7 +562,7 @@ class ClientCore:
         return exchange.heard_at + min(self._patience, ttl or self._patience)
 
     def silent_by(self, began: float) -> tuple[float, str]:
-        """Return the time at which to give up on a silent server, and the reason to report.
+        """Return the time limit for a silent server, and the message to report.
 
         Args:
             began: when the caller started to wait (monotonic). Earlier silence doesn't count.
@@ -569,11 +572,17 @@ class ClientCore:
         return max(began, self._heard) + SILENCE_LIMIT_S, f"the server sent nothing for {SILENCE_LIMIT_S:g} s"
 
     def goals_lost_at(self) -> float:
-        """Return the time at which followed goals become LOST, or inf while connected."""
+        """Return the time at which followed goals become LOST.
+
+        While connected, return inf.
+        """
         return float("inf") if self.absent_since is None else self.absent_since + self._patience
 
     def next_expiry(self) -> float:
-        """Return the time by which `expire` must be called, or inf for never."""
+        """Return the time by which `expire` must be called.
+
+        Return inf if there is no time limit.
+        """
         times = [self.answer_deadline(each) for each in self.exchanges.values()]
         if self.listeners.goals:
             times.append(self.goals_lost_at())
@@ -606,7 +615,7 @@ class ClientCore:
         return self._splitter.feed(data)
 
     def begin_stream(self) -> None:
-        """Discard an incomplete line, because a new stream begins."""
+        """Discard the incomplete line of the previous stream."""
         self._splitter = LineSplitter()
 
     def receive(self, data: bytes, now: float) -> None:
@@ -628,7 +637,7 @@ class ClientCore:
                 self.break_off(f"the server sent a malformed message: {error}", now)
 
     def match(self, message: JsonObject) -> Exchange | None:
-        """Return the exchange to which a message belongs, if there is one."""
+        """Return the exchange that a message belongs to, if any."""
         number = message.get("seq")
         return self.exchanges.get(number) if isinstance(number, int) else None
 
@@ -678,7 +687,10 @@ class ClientCore:
     # -- disconnecting and reconnecting
 
     def break_off(self, why: str, now: float) -> None:  # noqa: ARG002 - for subclasses that reconnect
-        """End the connection for good, unless a subclass reconnects."""
+        """End the connection for good.
+
+        Subclasses may reconnect instead.
+        """
         self.end(why)
 
     def end(self, why: str) -> None:

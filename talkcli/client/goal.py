@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 class GoalHandle(TrackedGoal):
-    """A handle for a goal that this client has sent or follows.
+    """A handle for following and cancelling a goal.
 
     Any number of threads may use it. Events are buffered until they are read. If there are more than 5,000 words and
     pauses, the oldest are dropped. `events`, `feedback` and `poll` read from the same buffer, so each event is returned
@@ -143,7 +143,7 @@ class GoalHandle(TrackedGoal):
                 raise failures[0]
 
     def cancel(self) -> Goal:
-        """Cancel the goal. Return it once it is silent.
+        """Cancel the goal, and wait until it has stopped. Return it.
 
         Raises:
             UnknownGoal: the server doesn't know the goal, for example because the server was restarted.
@@ -196,7 +196,7 @@ class GoalHandle(TrackedGoal):
             raise TimeoutError(f"goal {self.id} has not ended after {0 if timeout is None else round(timeout, 1):g} s")
 
     def _lose_if_disconnected(self) -> bool:
-        """If the connection has ended, end the goal as LOST and return True."""
+        """End the goal as LOST if the connection has ended. Return whether it has."""
         ended = self._connection.ended
         if ended is not None:
             with self._connection.changed:

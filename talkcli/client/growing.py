@@ -75,7 +75,7 @@ class TextSender:
 
 
 def _join_surrogates(text: str) -> str:
-    """Replace the surrogate pairs in a text by the characters that they stand for.
+    """Replace surrogate pairs in a text with the characters they represent.
 
     Programs that decode JSON in pieces may pass the halves of a pair separately. The server joins the halves that come
     in one request, so it would count fewer characters than this client.

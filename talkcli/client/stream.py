@@ -47,7 +47,7 @@ class SpeechStream:
         self._refused = False
 
     def write(self, text: str) -> bool:
-        """Add text at the end. Return whether the goal can still take text.
+        """Add text at the end. Return whether the goal accepts more.
 
         Text is sent at once, except blanks at the very beginning. If more than 10,000 characters have not been heard,
         the call waits until more of them have been heard.
@@ -86,11 +86,11 @@ class SpeechStream:
 
     @property
     def _stopped(self) -> bool:
-        """Whether the goal can't take more text, because it has ended or is being stopped."""
+        """Whether the goal has ended or is being stopped."""
         return self._refused or (self.goal is not None and self.goal.state.terminal)
 
     def _send(self) -> bool:
-        """Send all text that can be sent. Return whether the goal can still take text."""
+        """Send all text that can be sent. Return whether the goal accepts more."""
         connection, resends = self._connection, 0
         while not self._stopped and (request := self._text.request_to_send()):
             if isinstance(request, Say):
@@ -134,13 +134,13 @@ class SpeechStream:
         self.goal._grow(addition)
 
     def _break_off(self) -> None:
-        """Stop the goal, because its text will never be complete."""
+        """Stop a goal whose text will never be complete."""
         assert self.goal
         with suppress(TalkError):
             self._connection.request(Append(self.goal.id, broken=True))
 
     def _process_error(self, error: TalkError) -> bool:
-        """Record that text could not be added. Return whether the goal can still take other text."""
+        """Handle an error while adding text. Return whether the goal accepts other text."""
         assert self.goal
         if isinstance(error, RequestRefused) and error.code == "goal_ended":
             self._refused = True

@@ -39,7 +39,7 @@ class Sender:
     name: str | None = None
 
     def to_json(self) -> JsonObject:
-        """Return the JSON object that clients receive."""
+        """Return the sender as a JSON object for clients."""
         return fields(self)
 
     @classmethod
@@ -50,7 +50,7 @@ class Sender:
 
 @frozen
 class By:
-    """The goal or client that ended a goal, or the client that paused or resumed speech.
+    """The goal or client that ended a goal, paused speech or resumed it.
 
     Both fields are None if the server itself ended the goal.
     """
@@ -59,7 +59,7 @@ class By:
     client: Sender | None = None
 
     def to_json(self) -> JsonObject | None:
-        """Return the goal or the client as a JSON object, or None for the server itself."""
+        """Return the goal or client as a JSON object. Return None for the server itself."""
         if self.goal is not None:
             return {"goal": self.goal}
         return None if self.client is None else {"client": self.client.to_json()}
@@ -83,12 +83,12 @@ class Output:
     muted: bool
 
     def to_json(self) -> JsonObject:
-        """Return the JSON object that clients receive."""
+        """Return the audio output as a JSON object for clients."""
         return fields(self)
 
     @classmethod
     def from_json(cls, value: object) -> Output | None:
-        """Read an output from a JSON object. Return None if a field is missing or malformed."""
+        """Read an audio output from a JSON object. Return None if a field is missing or malformed."""
         found = read_fields(cls, value)
         return cls(**found) if len(found) == len(cls.__annotations__) else None
 
@@ -136,12 +136,12 @@ class Goal:
 
     @property
     def exit_code(self) -> int | None:
-        """Exit code of a command that waits for this goal, or None if the goal hasn't ended."""
+        """Exit code of a command that waits for this goal. It is None until the goal ends."""
         # Throttling is not a failure, because the sender asked for it.
         return 0 if self.reason == "throttled" else EXIT_CODES.get(self.state)
 
     def to_json(self) -> JsonObject:
-        """Return the JSON object that clients receive."""
+        """Return the goal as a JSON object for clients."""
         # A loop over the fields would be slower, and a busy server spends most of its time here.
         return {
             "id": self.id,
@@ -201,7 +201,10 @@ def message_details(message: str | None) -> str:
 
 
 def _create_reader(kind: type) -> Callable[[object], object]:
-    """Return a function that returns its argument if it has this type, and None otherwise."""
+    """Return a function that accepts only values of this type.
+
+    The function returns None for all other values.
+    """
     return lambda value: value if type(value) is kind else None
 
 

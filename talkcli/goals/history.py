@@ -1,4 +1,4 @@
-"""The scheduler's records of ended goals, past speech and early cancels.
+"""The scheduler's records of ended goals, past speech and early cancel requests.
 
 Each store has a maximum size and drops its oldest entries. Methods receive the time as an argument, in monotonic
 seconds. Ended goals are kept so that another process can still ask for the result, for example with `talk wait ID`. An
@@ -33,10 +33,9 @@ MAX_RECALLED_GOALS = 1_000
 MAX_KEPT_TEXT_BYTES = 8 * 1024 * 1024
 #: Maximum number of keys and texts whose last start time is kept.
 MAX_SPEECH_TIMES = 20_000
-#: How long to remember a cancel for an unknown id. If two programs send the goal and its cancel, the cancel may arrive
-#: first.
+#: How long to remember a cancel request for an unknown id. Another program may send the goal a moment later.
 EARLY_CANCEL_S = 60.0
-#: Maximum number of cancels for unknown ids to remember.
+#: Maximum number of cancel requests for unknown ids to remember.
 MAX_EARLY_CANCELS = 1_000
 
 
@@ -107,14 +106,14 @@ class SpeechTimes:
 
 
 class EarlyCancels:
-    """Cancels that arrived before the goals they refer to."""
+    """Cancel requests that arrived before their goals."""
 
     def __init__(self) -> None:
-        #: expiry time and sender of each cancel, by goal id
+        #: expiry time and sender of each cancel request, by goal id
         self._cancels: OrderedDict[str | None, tuple[float, By]] = OrderedDict()
 
     def add(self, goal_id: str, by: By, now: float) -> None:
-        """Remember a cancel for a goal that hasn't arrived yet."""
+        """Remember a request to cancel a goal that hasn't arrived yet."""
         _set_newest(self._cancels, goal_id, (now + EARLY_CANCEL_S, by), MAX_EARLY_CANCELS)
 
     def find(self, goal_id: str | None, now: float) -> By | None:

@@ -65,7 +65,10 @@ _MAX_FLOAT = 1.7976931348623157e308
 
 
 def without_speaker(voice: str | None) -> str:
-    """Return the id of a voice without its speaker, or an empty string for None."""
+    """Return a voice's id without the speaker.
+
+    Return an empty string for None.
+    """
     return (voice or "").partition(SPEAKER_MARK)[0]
 
 
@@ -676,7 +679,7 @@ class Cancel:
 
 
 def require_fields(data_class: type, options: Iterable[str]) -> None:
-    """Raise TypeError if a class has no field for one of the options.
+    """Raise TypeError if a class has no field for an option.
 
     Called when a module is imported.
     """
@@ -764,12 +767,15 @@ def engine_options(say: Say, settings: Set) -> dict[str, Any]:
 
 
 def shown_settings(settings: Set) -> JsonObject:
-    """Return the settings for display. None stands for the default voice or no time limit."""
+    """Return the settings as shown to users.
+
+    None stands for the default voice or no time limit.
+    """
     return _replace_none_values(fields(settings))
 
 
 def _replace_none_values(values: dict[str, Any]) -> dict[str, Any]:
-    """Return a copy of the settings in which values that mean "none" are None."""
+    """Replace placeholder values, such as a `ttl` of 0, with None. Return the new settings."""
     return {name: None if value == _NONE_VALUES.get(name) else value for name, value in values.items()}
 
 

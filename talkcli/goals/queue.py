@@ -108,7 +108,7 @@ class Queue:
         return list(map(_record_of, self._expiries[: bisect_left(self._expiries, (now, inf))]))
 
     def _entries(self, record: Record) -> Iterator[tuple[list[_Entry], _Entry]]:
-        """Yield each sorted list that contains the goal, and the goal's entry in that list."""
+        """Yield each list that contains the goal, with the goal's entry."""
         entry = -record.say.priority, record.position, record
         yield self._goals, entry
         yield self._displaceable, (-record.say.priority, record.number, record)

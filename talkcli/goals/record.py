@@ -41,7 +41,7 @@ class Record:
     expires_at: float = inf
     #: length of the text when the goal was sent; a growing text gets longer
     first_chars: int = 0
-    #: hash of the text that was first sent, if the text was dropped to save memory, otherwise None
+    #: hash of the original text, if the text was dropped to save memory
     text_hash: int | None = None
     state: State = State.PENDING
     #: position in the queue among the goals of the same priority
@@ -53,15 +53,15 @@ class Record:
     begun_end: int = 0
     #: offset of the end of the last word that was heard completely
     spoken_end: int = 0
-    #: how many seconds of the audio were heard, as far as is known
+    #: how many seconds of the audio are known to have been heard
     heard: float = 0.0
     #: whether the text may still grow
     more: bool = False
-    #: whether the text broke off, so that the goal can't succeed
+    #: whether the text broke off. Such a goal can't succeed.
     broken: bool = False
     #: whether the goal is silent because the next part of its text is missing
     waits: bool = False
-    #: number of characters that were heard, or that were not spoken before the goal waited for text
+    #: number of characters that were heard, or skipped before the goal waited for text
     passed_chars: int = 0
     #: monotonic time by which more text must arrive, or inf
     stalls_at: float = inf

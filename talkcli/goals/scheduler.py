@@ -60,7 +60,10 @@ class StateChange:
 
 
 class Order(Enum):
-    """An order to the engine about a goal. The value is the order's name in the log."""
+    """An order to the engine about a goal.
+
+    The value is the order's name in the log.
+    """
 
     START = "Start"
     #: become silent, then report that the goal has ended
@@ -134,7 +137,7 @@ class Scheduler:
         self.paused = False
         #: whether goals can start. If no engine can be started, they start and fail at once.
         self.has_engine = False
-        #: goals whose sender left before their text ended, and when they end if no other connection continues the text
+        #: goals with incomplete texts whose sender left, and the time at which they end if nobody continues them
         self._orphans: dict[Record, float] = {}
         #: whether `shutdown` was called, so that new goals are rejected
         self.closing = False
@@ -450,7 +453,7 @@ class Scheduler:
         record.heard = max(record.heard, seconds)
 
     def text_missing(self, goal_id: str, length: int, now: Now, *, missing: bool) -> None:
-        """Record whether the active goal is silent because the next part of its text is missing.
+        """Record whether the active goal is silent while it waits for text.
 
         `length` is the number of characters that the engine has received.
         """
@@ -564,7 +567,10 @@ class Scheduler:
     # -- time limits
 
     def deadline(self) -> float:
-        """Return the monotonic time at which `tick` must be called next, or inf for never."""
+        """Return the monotonic time at which to call `tick` next.
+
+        Return inf if there is no time limit.
+        """
         deadlines = (self._active_deadline(), self.pending.next_expiry(), self._next_deadline())
         return min(*deadlines, *self._orphans.values())
 
@@ -637,7 +643,7 @@ class Scheduler:
         return options.bad_text(say.text, limit) or refusal
 
     def _find_repeat(self, say: Say, record: Record, now: Now) -> Refusal | None:
-        """If a goal repeats another one too soon, return a refusal and set `record.by`."""
+        """Return a refusal if a goal repeats another one too soon. Store the other goal's id in `record.by`."""
         if say.throttle is None:
             return None
         active = self.active
@@ -656,11 +662,17 @@ class Scheduler:
         return Reason.THROTTLED, f"{what} {words}"
 
     def _may_preempt(self, say: Say) -> bool:
-        """Return whether a goal may interrupt others, because of its options or the server's setting."""
+        """Return whether a goal may interrupt others.
+
+        The goal's options take precedence over the server's setting.
+        """
         return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)
 
     def _find_room(self, say: Say) -> list[tuple[Record, Reason]] | None:
-        """Return the goals to remove for a new goal and the reasons, or None if there is no room."""
+        """Find room in the queue for a new goal. Return the goals to remove, with reasons.
+
+        Return None if there is no room.
+        """
         replaced = self.pending.with_key(say.key)
         preempted: list[Record] = []
         if self._may_preempt(say):
@@ -695,7 +707,10 @@ class Scheduler:
     # -- voices
 
     def _request_voice(self, voice: str, now: Now) -> None:
-        """Plan to load a voice for a goal, if it is neural and an engine process is running."""
+        """Plan to load a goal's voice if it is neural.
+
+        Do nothing while no engine process is running.
+        """
         if self._loads_voices and options.is_neural(model := options.without_speaker(voice)):
             self.voices.request(model, now.monotonic)
 
@@ -756,14 +771,14 @@ class Scheduler:
         return inf if self.has_engine or goal.begun_end else goal.expires_at
 
     def _next_deadline(self) -> float:
-        """Return the monotonic time at which to try to start the next goal."""
+        """Return the monotonic time of the next attempt to start a goal."""
         record = None if self.active or self.paused or not self.has_engine else self.pending.first()
         if record is None:
             return inf
         return 0.0 if record.next_since == inf else self._start_time(record)
 
     def _start_time(self, record: Record) -> float:
-        """Return the monotonic time until which a goal waits for its voice."""
+        """Return the monotonic time at which a goal stops waiting for its voice."""
         return self.voices.start_time(record, self.settings.voice) if self._loads_voices else 0.0
 
     def _start_next(self, now: Now) -> list[Effect]:
@@ -777,9 +792,9 @@ class Scheduler:
         return [*effects, EngineOrder(record, Order.START)] if record else effects
 
     def _activate_next(self, now: Now) -> tuple[Record | None, list[Effect]]:
-        """Make the next goal ACTIVE if possible. Return the goal or None, and the effects.
+        """Make the next goal ACTIVE if possible. Return it and the effects.
 
-        The effects don't contain the order to speak the goal.
+        Return None instead of a goal if no goal can start. The effects don't contain the order to speak the goal.
         """
         if self.active or self.paused:
             return None, []
@@ -823,7 +838,7 @@ class Scheduler:
         record.stalls_at = now.monotonic + record.say.stall if record.waits and record.more else inf
 
     def _require_active(self, goal_id: str) -> Record:
-        """Return the active goal, or raise IllegalTransition if it has another id."""
+        """Return the active goal. Raise IllegalTransition if it has another id."""
         if self.active is None or self.active.id != goal_id:
             raise IllegalTransition(f"goal {goal_id} is not being spoken")
         return self.active

@@ -129,15 +129,15 @@ class VoiceScheduler:
             found.wanted = True
 
     def forget_failure(self, voice: str) -> None:
-        """Forget that a voice failed to load, so that the next request loads it without delay."""
+        """Forget that a voice failed to load. The next request loads it without delay."""
         found = self._voices.get(voice)
         if found and found.state is VoiceState.FAILED and voice != self._loading:
             del self._voices[voice]
 
     def start_time(self, record: Record, default_voice: str | None) -> float:
-        """Return the monotonic time until which the next goal waits for its voice, or 0 if it doesn't wait.
+        """Return the monotonic time at which the next goal stops waiting for its voice.
 
-        Urgent goals don't wait. Other goals stop waiting before they expire. A
+        Return 0 if the goal doesn't wait. Urgent goals don't wait. Other goals stop waiting before they expire. A
         `voice_only` goal waits until its voice is loaded or has failed.
 
         Args:
@@ -155,7 +155,7 @@ class VoiceScheduler:
         return min(start, record.expires_at - EXPIRY_MARGIN_S)
 
     def failure(self, voice: str) -> str | None:
-        """Return the reason why a voice could not be loaded, or None if it didn't fail."""
+        """Return the reason why a voice failed to load, if it did."""
         found = self._voices.get(voice)
         return found.why if found and found.state is VoiceState.FAILED else None
 
@@ -167,7 +167,7 @@ class VoiceScheduler:
 
     @property
     def can_load(self) -> bool:
-        """Whether a voice is waiting to be loaded and the engine is not loading another one."""
+        """Whether a waiting voice can be loaded now."""
         return self._loading is None and any(each.wanted for each in self._voices.values())
 
     def load_next(self, needed: Sequence[str], default_voice: str, now: float) -> VoiceLoadOrder | None:
@@ -287,9 +287,9 @@ class VoiceScheduler:
         return max(self._used_bytes, sum(self._loaded_bytes().values()))
 
     def _voices_to_drop(self, size_bytes: int, keep: Collection[str]) -> tuple[str, ...] | None:
-        """Return the voices to drop to make room for a new one, or None if it can't fit.
+        """Return the voices to drop to make room for a new one.
 
-        The least recently used voices are dropped first.
+        Return None if there can't be enough room. The least recently used voices are dropped first.
 
         Args:
             size_bytes: the memory use of the new voice.

@@ -38,7 +38,7 @@ class ServerStatus:
     recent: tuple[Goal, ...]
 
     def to_json(self) -> JsonObject:
-        """Return the JSON object that clients receive."""
+        """Return the status as a JSON object for clients."""
         return {
             "server": self.server,
             "active": None if self.active is None else self.active.to_json(),
@@ -246,7 +246,7 @@ def _event_json(kind: str, event: StateChanged | WordHeard | TextAdded | TextMis
 
 
 def goals(items: list[JsonObject], name: str) -> Iterator[Goal]:
-    """Yield the goal in this field of each list item, if any. Raise Unreadable if one is malformed."""
+    """Yield the goals in one field of the list items. Raise Unreadable if a goal is malformed."""
     return (Goal.from_json(each[name]) for each in items if name in each)
 
 

@@ -157,7 +157,7 @@ _json_functions: dict[str, Callable[[Any], Any]] = {}
 
 
 def _json_function(name: str) -> Callable[[Any], Any]:
-    """Return the JSON function called `decode`, `encode` or `escape`.
+    """Return one of the functions that decode, encode and escape JSON.
 
     The first call creates all three.
     """

@@ -65,10 +65,10 @@ class Handler(Protocol):
         """Remove a client that has disconnected."""
 
     def handle(self, connection: ClientConnection, seq: int | None, request: Request) -> None:
-        """Start to carry out a client's request."""
+        """Start handling a client's request."""
 
     def input_ended(self, connection: ClientConnection) -> None:
-        """Break off a client's incomplete texts, because the client will send nothing more."""
+        """Break off a client's incomplete texts after the end of its input."""
 
     def is_waiting(self, connection: ClientConnection) -> bool:
         """Return whether a client is still waiting for a reply or an event."""
@@ -116,7 +116,10 @@ class PendingRequest:
                 timer.cancel()
 
     def resume(self, in_time: bool = True) -> None:
-        """Continue the request if it is waiting. Its `wait` returns `in_time`."""
+        """Continue the request if it is waiting.
+
+        Its call of `wait` returns `in_time`.
+        """
         if self._leave():
             self._step(in_time)
 
@@ -185,7 +188,7 @@ def resume_all(waiting_list: WaitingList) -> None:
 
 @coroutine
 def _wait_in(waiting_list: WaitingList) -> Generator[WaitingList, bool, bool]:
-    """Suspend a request in this waiting list. Return whether it was resumed in time."""
+    """Suspend a request in a waiting list. Return whether it was resumed in time."""
     return (yield waiting_list)
 
 
@@ -274,7 +277,7 @@ class ClientConnection(asyncio.Protocol):
     # -- called by the handler
 
     def send(self, message: JsonObject | bytes) -> None:
-        """Send a reply or an encoded line after all unfinished lists.
+        """Send a reply or an encoded line. Unfinished lists are sent first.
 
         If too many lines wait, disconnect the client.
         """
@@ -326,7 +329,7 @@ class ClientConnection(asyncio.Protocol):
     # -- internals
 
     def _close_after(self, seconds: float, message: str) -> asyncio.TimerHandle:
-        """Start and return a timer that closes the connection with an error message."""
+        """Start a timer that closes the connection with an error message. Return the timer."""
         return self._loop.call_later(seconds, self.close_with, failure(None, "too_slow", message))
 
     def _update_reading(self) -> None:
@@ -390,7 +393,7 @@ class ClientConnection(asyncio.Protocol):
             self._loop.call_soon(self._do_scheduled_work)
 
     def _do_scheduled_work(self) -> None:
-        """Call `_work` in the iteration for which it was scheduled."""
+        """Do the scheduled work, and allow it to be scheduled again."""
         self._work_is_scheduled = False
         self._work()
 

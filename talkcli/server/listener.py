@@ -71,7 +71,7 @@ class Listener:
         return _identity(self.path) == self._identity and _is_lock_of(self.path, self._lock)
 
     def bind_again(self) -> socket.socket | None:
-        """Recreate a missing socket or lock file. Return the old socket if it was replaced.
+        """Recreate a missing socket or lock file. Return the replaced socket, if any.
 
         Returns:
             The old socket, which the caller must close, or None if it is still in use.
@@ -123,7 +123,7 @@ class InheritedListener:
         return _identity(self.path) == self._identity
 
     def bind_again(self) -> socket.socket | None:
-        """Raise AddressInUse, because only systemd can create the socket file again.
+        """Raise AddressInUse. Only systemd can create the socket file again.
 
         If only the server were restarted, systemd would pass the old socket again.
         """
@@ -169,7 +169,7 @@ def _raise_in_use(problem: str) -> Iterator[None]:
 
 
 def _identity(path: str) -> tuple[int, int] | None:
-    """Return the device and inode numbers of a file, or None if it can't be accessed."""
+    """Return the device and inode numbers of a file, if it can be accessed."""
     try:
         status = os.lstat(path)
     except OSError:
@@ -208,7 +208,7 @@ def _path_of(passed: socket.socket) -> str:
 
 
 def _refuse_second_server(path: str | None) -> None:
-    """Raise AddressInUse if clients would connect to another server instead of this one."""
+    """Raise AddressInUse if clients can already reach another server."""
     try:
         found = connect(path, hello(None, urgent=True))
     except (ServerUnavailable, AccessDenied):
@@ -296,9 +296,10 @@ def _bind(path: str, mode: int) -> socket.socket:
 
 
 def _acquire_lock(path: str) -> int:
-    """Lock a socket's path. Return the descriptor of the lock file, or raise AddressInUse.
+    """Lock a socket's path. Return the descriptor of the lock file.
 
-    The file contains the id of this process. Closing the descriptor ends the lock.
+    Raise AddressInUse if another server holds the lock. The file contains the id of this process. Closing the
+    descriptor ends the lock.
     """
     while True:
         fd = _open_lock(f"{path}.lock")
@@ -364,7 +365,7 @@ def _process_exists(pid: int) -> bool:
 
 
 def _read_holder(fd: int) -> int | None:
-    """Wait briefly until a lock file contains its holder's process id. Return the id, if any.
+    """Wait briefly for the process id in a lock file. Return it, if any.
 
     The id of a process that no longer exists was written by an earlier server, and is ignored.
     """

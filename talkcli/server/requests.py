@@ -72,7 +72,7 @@ class Requests:
         speech.on_queue_change = self._schedule_room_check
 
     def handle(self, connection: ClientConnection, seq: int | None, request: Request) -> None:
-        """Start to carry out a client's request."""
+        """Start handling a client's request."""
         pending = PendingRequest(connection, seq, request)
         connection.unanswered[pending] = None
         pending.start(self._carry_out(pending))
@@ -89,7 +89,7 @@ class Requests:
         self.input_ended(connection)
 
     def input_ended(self, connection: ClientConnection) -> None:
-        """Break off a client's incomplete texts, because the client will send nothing more."""
+        """Break off a client's incomplete texts after the end of its input."""
         for record in [record for record, producer in self._producers.items() if producer is connection]:
             del self._producers[record]
             self._speech.apply(self._scheduler.producer_left(record, self._speech.advance_time()))
@@ -143,9 +143,9 @@ class Requests:
             each.resume()
 
     def _reserve_memory(self, pending: PendingRequest) -> bool:
-        """Count the memory of a waiting request. If too many wait, set `refusal` and return False.
+        """Reserve memory for a waiting request. Return False if too many requests wait.
 
-        The request is then carried out without waiting, and the refusal rejects its goal.
+        In this case, set `refusal`. The request is carried out without waiting, and the refusal rejects its goal.
         """
         if pending.kept_bytes:
             return True  # the request has waited before
@@ -293,7 +293,7 @@ class Requests:
         return producer is None or producer.detect_hang_up()
 
     def _check_goal(self, pending: PendingRequest, say: Say) -> tuple[Say, Refusal | None]:
-        """Look up a goal's voice. Return the goal with the voice's id, and a reason to refuse it, if any.
+        """Look up a goal's voice. Return the goal with the voice's id, and any refusal.
 
         Refusals that need a clock, files or other I/O belong here. The scheduler decides about all others.
         """

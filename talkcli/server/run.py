@@ -183,7 +183,7 @@ class Server:
             raise self._fatal_error
 
     def _apply_configured_voice(self) -> str | None:
-        """Use the configured voice if it is neural. Otherwise, return it, because the engine must check it.
+        """Apply the configured voice if it is neural. Otherwise, return it for the engine to check.
 
         A neural voice is loaded later, so that it doesn't delay speech.
 

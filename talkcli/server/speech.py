@@ -124,7 +124,7 @@ class Speech:
         self._reports: deque[Report] = deque()
         #: whether the event loop has been woken to process reports. Waking it for each report would be too slow.
         self._reports_due = False
-        #: what the engine was last told about the next goal: whether there is one, and whether its voice is neural
+        #: whether there is a next goal, and whether its voice is neural, as last reported to the engine
         self._announced_next = False, False
 
     def status_words(self) -> str:
@@ -146,7 +146,7 @@ class Speech:
         return self.voices.listed is None and self.engine_status in {"starting", READY}
 
     def _waiting_for_room(self) -> Iterator[ClientConnection]:
-        """Yield the connections whose goals wait for room in the queue, or whose texts wait to be heard."""
+        """Yield the connections that wait for room in the queue or for a text to be heard."""
         for each in chain(self.waiting_for_room, *self.waiting_for_hearing.values()):
             yield each.connection
 
@@ -398,7 +398,7 @@ class Speech:
         self.apply(effects)
 
     def _handle_ready(self, ready: protocol.Ready, now: Now) -> None:
-        """Record and log that an engine is ready. Use its voice and start the next goal."""
+        """Record that an engine is ready, and start the next goal. The first engine also sets the default voice."""
         if self.ready is None and ready.voice is not None:
             self.apply(self.scheduler.change_settings({"voice": ready.voice}, now))
         if self.ready is None or self.ready != replace(ready, player=self.ready.player):
@@ -442,7 +442,7 @@ class Speech:
 
 
 def _log_goal_end(record: Record, seconds: float) -> None:
-    """Log the end of a goal that was active for `seconds`."""
+    """Log how a goal ended, and how many seconds it was active."""
     took = "" if record.started_at is None else f" after {seconds:.1f} s"
     how = f"{record.id} {record.state.name}{took}"
     if record.state is not State.SUCCEEDED:

@@ -67,7 +67,7 @@ class ClientStreams:
         self._written: dict[ClientStream, None] = {}
 
     def shed_load(self) -> None:
-        """Disconnect the clients with the most unread output until the rest is below the limit."""
+        """Disconnect the slowest readers until the unread output is below the limit."""
         while self.unread_bytes > MAX_TOTAL_OUTPUT_BYTES and self.open:
             max(self.open, key=lambda each: each.unsent_bytes + each.held_bytes).abort()
             total = MAX_TOTAL_OUTPUT_BYTES >> 20
@@ -172,7 +172,7 @@ class ClientStream:
         return len(self._unread)
 
     def count_held(self, added_bytes: int) -> None:
-        """Adjust the size of the output that the receiver holds back. Enforce the total limit."""
+        """Adjust the size of the output held by the receiver. Enforce the total limit."""
         if self in self._streams.open:
             self.held_bytes += added_bytes
             self._streams.unread_bytes += added_bytes

@@ -199,7 +199,7 @@ class Notifications:
             self._work(self._streams.unread_bytes)
 
     async def wait_done(self, request: PendingRequest) -> None:
-        """Let a request wait until all functions now in the queue have been called."""
+        """Let a request wait until the functions in the queue have been called."""
         if self._pending:
             self._pending.append(request.resume)
             await request.wait({})
@@ -227,7 +227,7 @@ class Notifications:
             self._next_call = self._loop.call_soon(self._work, min(unread_before, self._streams.unread_bytes))
 
     def _await_readers(self, unread_before: int, until: float) -> None:
-        """Continue `_work` once clients have read the new output, or at the time `until`."""
+        """Resume calling functions once clients have read the new output, or at `until`."""
         if self._streams.unread_bytes <= unread_before:
             self._work(unread_before)
         elif self._loop.time() < until:

@@ -89,7 +89,7 @@ class VoiceCatalog:
 
     @property
     def _foreign_driver(self) -> str | None:
-        """The name of the engine's driver, or None if the driver is `talk`'s own.
+        """The name of the engine's driver, unless it is one of `talk`'s own.
 
         Other drivers have no neural voices.
         """
