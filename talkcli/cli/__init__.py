@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def main() -> NoReturn:
-    """Run the command line in `sys.argv`, and exit."""
+    """Run the command line in `sys.argv`. Then exit."""
     try:
         code = run(sys.argv[1:])
     except KeyboardInterrupt:  # no command has been started yet
@@ -30,7 +30,7 @@ def main() -> NoReturn:
 
 
 def run(arguments: list[str]) -> int:
-    """Run a command line, and return its exit code."""
+    """Run a command line. Return its exit code."""
     _prepare_streams()
     # The parent process may have left SIGCHLD ignored. The exit statuses of child processes would then be lost.
     _signal.signal(_signal.SIGCHLD, _signal.SIG_DFL)

@@ -62,7 +62,7 @@ def status(options: CommonOptions, goal_id: str | None, long: bool) -> None:
 
 
 def watch(options: CommonOptions, words: bool, long: bool) -> int:
-    """Show the events of all goals until interrupted. Show each word, too, if `words` is true.
+    """Show the events of all goals until interrupted. If `words` is true, show each word as well.
 
     Return the exit code.
     """
@@ -148,7 +148,7 @@ def _report_pause(options: CommonOptions, goal: Goal | None, *, paused: bool, me
 
 
 def doctor(options: CommonOptions, silent: bool) -> int:
-    """Run the doctor's checks, show the findings and the next step, and return the exit code."""
+    """Run the doctor's checks. Show the findings and the advice. Return the exit code."""
     from talkcli.cli.interrupts import Interrupts
     from talkcli.doctor.report import format_conclusion, format_finding, next_steps
     from talkcli.goals.states import EXIT_CODES, State
@@ -212,7 +212,7 @@ def _suggest_key(key: str, client: Client) -> None:
 
 
 def _describe_missing_voice(language: str, voices: Iterable[JsonObject]) -> str:
-    """Return the error message for a language without a voice."""
+    """Return the error message for a language that no voice speaks."""
     from talkcli.goals.options import is_neural
     from talkcli.terminal.text import printable
 

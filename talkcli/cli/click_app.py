@@ -61,7 +61,7 @@ class _OptionType(click.FloatRange):
         super().__init__(*option.limits, min_open=option.excludes_minimum)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Parse the value of an option, or raise BadParameter."""
+        """Parse the value of an option. Raise BadParameter if it is invalid."""
         try:
             return read_value(self._option, str(value))
         except ValueError as error:
@@ -121,7 +121,7 @@ def _make_click_argument(argument: Option) -> click.Argument:
 
 
 def _make_completer(completer: str) -> Callable[..., list[CompletionItem]] | None:
-    """Return a function that completes a value for click, or None if there is no completer."""
+    """Return a function that completes a value for click, if there is a completer."""
 
     def complete(context: click.Context, _: click.Parameter, incomplete: str) -> list[CompletionItem]:
         from talkcli.cli import completion
@@ -132,7 +132,7 @@ def _make_completer(completer: str) -> Callable[..., list[CompletionItem]] | Non
 
 
 def _store_common(context: click.Context, parameter: click.Parameter, value: object) -> None:
-    """Store the value of a common option in the CommonOptions object."""
+    """Store the value of an option that all commands share."""
     if value:
         setattr(context.ensure_object(CommonOptions), parameter.name or "", value)
 
@@ -202,7 +202,7 @@ class ClickCommand(_HelpfulCommand):
         formatter.write("\nCommon options and exit codes: talk --help\n")
 
     def _run(self, **given: Any) -> int | None:
-        """Run the command, and return its exit code.
+        """Run the command. Return its exit code.
 
         Raise a click.UsageError if its options can't be combined.
         """
@@ -239,13 +239,13 @@ class _CommandGroup(_HelpfulCommand, click.Group):
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
-        """Create the command with this name, or return None if there is none."""
+        """Create the command with this name. Return None if there is no such command."""
         return ClickCommand(COMMANDS[cmd_name]) if cmd_name in COMMANDS else None
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Return a command's name, the command and its arguments.
+        """Find the command in the arguments. Return its name, the command and its own arguments.
 
         Raise click.UsageError for an unknown command.
         """
@@ -301,7 +301,7 @@ def run(arguments: list[str]) -> int:
 
 
 def _run_group(arguments: list[str], options: CommonOptions) -> object:
-    """Run a command line with click, and return its result.
+    """Run a command line with click. Return its result.
 
     Report click's errors, and return their exit codes.
     """
@@ -352,7 +352,7 @@ def _quote_for_shell(text: str) -> str:
 
 
 def _describe_error(error: click.ClickException) -> str:
-    """Return click's error message, reworded in the style of `talk`."""
+    """Return the text of a click error, in the style of `talk`."""
     if isinstance(error, click.NoSuchOption):
         # Leading dashes would make unrelated options look similar.
         near = nearest(error.option_name.lstrip("-"), [each.lstrip("-") for each in error.possibilities or ()])

@@ -85,7 +85,7 @@ class Command:
     exit_codes: ExitCodes | None = None
 
     def usage_fault(self, given: Mapping[str, Any], typed: frozenset[str], common: Mapping[str, Any]) -> str | None:
-        """Return an error message if options are invalid or can't be combined, otherwise None.
+        """Return an error message if the options are invalid or can't be combined.
 
         Args:
             given: the values of the command's own options and of its argument, by name.
@@ -216,7 +216,7 @@ def read_value(option: Option, text: str) -> Any:
 
 
 def _parse_number(option: Option, text: str) -> float:
-    """Parse a number that the option accepts, or raise ValueError."""
+    """Parse a number for this option. Raise ValueError if it is invalid."""
     whole = option.kind is INTEGER
     try:
         value = int(text) if whole else float(text)
@@ -232,7 +232,7 @@ def _parse_number(option: Option, text: str) -> float:
 
 
 def _parse_file_mode(text: str) -> int:
-    """Parse the file mode of a socket, or raise ValueError if it isn't suitable.
+    """Parse the file mode of a socket. Raise ValueError if it isn't suitable.
 
     The owner must be able to read and write, and nobody may have execute permission.
     """

@@ -51,7 +51,7 @@ _BASH_SPECIAL = re.compile(r"[^\w@%+=:,./-]")
 
 
 def print_completions(talk: click.Command, options: CommonOptions) -> int:
-    """Print the completions that the shell's script asks for, and return the exit code."""
+    """Print the completions that the shell's script asks for. Return the exit code."""
     try:
         click.echo("\n".join(_completion_lines(talk, options)).encode())
     except Exception:
@@ -74,7 +74,7 @@ def _completion_lines(talk: click.Command, options: CommonOptions) -> list[str]:
 
 
 def _format_for_bash(incomplete: str, value: str, _: str | None) -> str:
-    """Format the part of a value that bash will insert, and quote it.
+    """Format and quote a value for bash.
 
     bash replaces the text in COMP_CWORD, which may be only the last part of the word.
     """
@@ -87,7 +87,10 @@ def _format_for_bash(incomplete: str, value: str, _: str | None) -> str:
 
 
 def _format_for_zsh(_: str, value: str, help_text: str | None) -> str:
-    """Format a value and its help text for zsh, which quotes the value itself."""
+    """Format a value and its help text for zsh.
+
+    zsh quotes the value itself.
+    """
     if not help_text:
         return f"plain,{value}"
     value, help_text = (each.replace("\\", "\\\\") for each in (value, help_text))
@@ -96,7 +99,10 @@ def _format_for_zsh(_: str, value: str, help_text: str | None) -> str:
 
 
 def _format_for_fish(incomplete: str, value: str, help_text: str | None) -> str:
-    """Format a value and its help text for fish, which quotes the value itself."""
+    """Format a value and its help text for fish.
+
+    fish quotes the value itself.
+    """
     return f"plain,{_with_flag(value, incomplete)}" + (f"\t{help_text}" if help_text else "")
 
 
@@ -107,7 +113,7 @@ def completion(_: CommonOptions, shell: str) -> None:
 
 
 def _last_word(line: str) -> tuple[str, str]:
-    """Return the last word of a line, and its unclosed quotation mark, if any."""
+    """Return the last word of a line and its unclosed quotation mark, if any."""
     word, quote, escaped = "", "", False
     for character in line:
         if escaped:
@@ -126,7 +132,7 @@ def _last_word(line: str) -> tuple[str, str]:
 
 
 def _with_flag(value: str, incomplete: str) -> str:
-    """Put the flag in front of a value if the incomplete word is --option=VALUE."""
+    """Add the flag to a value if the user is typing --option=VALUE."""
     option, equals, _ = incomplete.partition("=")
     return f"{option}={value}" if equals and option.startswith("-") else value
 
@@ -244,7 +250,7 @@ def _request_status(options: CommonOptions) -> ServerStatus:
 
 
 def _offer_ids(goals: Iterable[Goal], status: ServerStatus, incomplete: str) -> Offers:
-    """Return the ids of goals as completions, also in short form if digits were typed."""
+    """Return the ids of goals as completions. Include short ids if digits were typed."""
     own = f"{status.server.get('boot')}-" if incomplete.isascii() and incomplete.isdecimal() else ""
     return [(name, _goal_help(each)) for each in goals for name in dict.fromkeys((each.id.removeprefix(own), each.id))]
 
@@ -265,6 +271,6 @@ def _goal_help(goal: Goal) -> str:
 
 
 def _voice_help(voice: JsonObject, field: str) -> str:
-    """Return the help text for a voice, without the field that is offered as the value."""
+    """Return the help text for a voice: its name and language, except the given field."""
     parts = [_shorten(str(voice.get(each) or "")) for each in ("name", "language") if each != field]
     return ", ".join(filter(None, parts)) or "voice"

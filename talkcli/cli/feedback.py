@@ -35,7 +35,7 @@ _CLEAR_LINE = "\r\x1b[2K"
 
 
 def make_feedback(options: CommonOptions) -> Feedback:
-    """Choose a display by the options and the kind of standard output. Return it."""
+    """Return the display that suits the options and the terminal."""
     if options.json:
         return _JsonFeedback()
     # With other encodings, the displayed width of characters is unknown.
@@ -104,7 +104,7 @@ class _TerminalFeedback(Feedback):
         self._resizes = _ResizeWatcher(self._paint)
 
     def begin(self, goals: Sequence[Goal]) -> None:
-        """Show the goal that is being spoken, or else the first unfinished one."""
+        """Show the goal that is being spoken. If there is none, show the first unfinished goal."""
         unfinished = [each for each in goals if not each.state.terminal]
         if unfinished and self._line is None:
             spoken = (each for each in unfinished if each.state is not State.PENDING)
@@ -112,7 +112,7 @@ class _TerminalFeedback(Feedback):
             self._paint()
 
     def show(self, goal: Goal, event: Event) -> None:
-        """Update the line after an event, or write the whole sentence of a goal that has ended."""
+        """Update the line after an event. When a goal ends, write its whole sentence."""
         line = self._line
         if isinstance(event, Result):
             self._show_end(event.goal)
@@ -183,7 +183,7 @@ class _ResizeWatcher(threading.Thread):
         self._blocked = {signal.SIGWINCH} - signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGWINCH})
         try:
             self.start()
-        except RuntimeError:  # no more threads can be started, so the line only adapts at the next event
+        except RuntimeError:  # the thread could not be started, so the line keeps its width until the next event
             self._closed = True
 
     def run(self) -> None:
@@ -192,7 +192,7 @@ class _ResizeWatcher(threading.Thread):
             self._on_resize()
 
     def close(self) -> None:
-        """Stop the thread, and unblock the signal that it waits for."""
+        """Stop the thread, and unblock its signal."""
         if not self._closed:
             self._closed = True
             assert self.ident

@@ -56,7 +56,7 @@ def _no_robot_error(broker: Broker, selection: Selection | None) -> ServerUnavai
 
 
 def _watch(options: CommonOptions, broker: Broker, selection: Selection | None, *, long: bool) -> int:
-    """Show the events of the selected robots until interrupted, and return the exit code."""
+    """Show the events of the selected robots until interrupted. Return the exit code."""
     from talkcli.cli.interrupts import Interrupts, has_reader
     from talkcli.fleet.desk.watch import FleetWatch
 

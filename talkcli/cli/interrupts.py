@@ -101,9 +101,9 @@ class Interrupts:
         return kind is Interrupted
 
     def handle_error(self, error: Interrupted | OSError) -> None:
-        """After an interrupt or an output error, record whether the output's reader is gone. Raise any other error.
+        """Handle an interrupt, a timeout or a missing reader. Raise any other error.
 
-        If the reader is gone, discard all output. Errors are unrelated if they are neither an interrupt nor a timeout.
+        Record in `reader_gone` whether the output's reader is gone. If it is, discard all output.
         """
         if isinstance(error, Interrupted | TimeoutError):
             self.reader_gone = STDOUT_FD in self.watched and not has_reader()
@@ -115,7 +115,7 @@ class Interrupts:
             discard_output()
 
     def prepare_cleanup(self) -> None:
-        """Clear the interrupt, so that only a new signal can interrupt the cleanup."""
+        """Clear the interrupt. After this, only a new signal interrupts the cleanup."""
         if self.signal_number is not None:
             signal.set_wakeup_fd(-1)  # a second SIGHUP must not interrupt the cleanup
         self.watched.pop(STDOUT_FD, None)

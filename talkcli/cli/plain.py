@@ -51,7 +51,7 @@ class PlainCommand:
 
 
 def read(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand | None:
-    """Parse a command line, or return None if click has to parse it."""
+    """Parse a command line. Return None if click has to parse it."""
     try:
         return _parse(arguments, environment)
     except (LookupError, ValueError, StopIteration):  # an option is unknown, or its value is invalid or missing
@@ -89,7 +89,7 @@ def _flag_table(options: Iterable[Option]) -> Flags:
 
 
 def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, Any]) -> None:
-    """Parse one option, and store its value in `given`. Take a separate argument from `rest`.
+    """Parse one option, and store its value in `given`. If necessary, take the value from `rest`.
 
     Raises:
         KeyError, ValueError, StopIteration: click has to parse the option.
@@ -105,7 +105,10 @@ def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, 
 def _build_command(
     command: Command, given: dict[str, Any], words: list[str], environment: Mapping[str, str]
 ) -> PlainCommand | None:
-    """Add defaults, and check the options. Return the command, or None if click has to parse it."""
+    """Add defaults, and check the options. Return the complete command.
+
+    Return None if click has to parse the command line.
+    """
     common = {name: given.pop(name) for name in _COMMON_NAMES & given.keys()}
     typed = frozenset(given)
     for option in command.options:
@@ -124,7 +127,10 @@ def _build_command(
 
 
 def run(parsed: PlainCommand) -> int:
-    """Run a parsed command, and return its exit code. Send its request early if possible."""
+    """Run a parsed command. Return its exit code.
+
+    Send the request early if possible.
+    """
     started_at = time.monotonic()
     command, given = parsed.command.name, parsed.given
     blocked: set[int] = set()
@@ -158,7 +164,7 @@ def may_send_early(parsed: PlainCommand) -> bool:
 
 
 def _connect_early(parsed: PlainCommand, before_sending: Callable[[], None]) -> ConnectionAttempt | None:
-    """Connect to the server, and send the request if it is simple enough. Return the connection attempt.
+    """Connect to the server, and send a simple request. Return the connection attempt.
 
     Args:
         parsed: the command.
@@ -176,7 +182,7 @@ def _connect_early(parsed: PlainCommand, before_sending: Callable[[], None]) -> 
 
 
 def early_messages(parsed: PlainCommand) -> tuple[JsonObject, JsonObject] | None:
-    """Return a command's hello and request messages, or None if they can't be sent early."""
+    """Return a command's hello and request messages if they can be sent early."""
     command, name = parsed.command, sender_name(parsed.given.get("name"))
     request = _early_request(command.name, parsed.given)
     if request is None or len(name or "") > MAX_SENDER_NAME_CHARS:
@@ -185,7 +191,7 @@ def early_messages(parsed: PlainCommand) -> tuple[JsonObject, JsonObject] | None
 
 
 def _early_request(command: str, given: dict[str, Any]) -> JsonObject | None:
-    """Return a command's request message, or None if it isn't simple enough to send early."""
+    """Return a command's request message if it is simple enough to send early."""
     from talkcli.protocol.lines import request_to_json
 
     if command == "say":
@@ -212,7 +218,7 @@ def _is_full_id(goal_id: str) -> bool:
 
 
 def _say_request(given: dict[str, Any]) -> Say | None:
-    """Return the request to say a text, or None if the text is invalid or too long."""
+    """Return the request to speak a text. Return None if the text is invalid or too long."""
     options = {each.name: given[each.name] for each in Say.options if each.name in given}
     say = Say(**{**options, "text": " ".join(given["text"]), "wait": given["wait"] or given["feedback"]})
     try:

@@ -120,7 +120,7 @@ def replace_and_report_bad_bytes(text: str, options: CommonOptions) -> str:
 
 
 def _report_sent(goal: GoalHandle, options: CommonOptions, reporter: GoalReporter) -> int:
-    """Report whether a goal was accepted or rejected, and return the exit code."""
+    """Report whether a goal was accepted or rejected. Return the exit code."""
     if goal.state is State.REJECTED:
         code = reporter.report_refused(goal.goal)
         if goal.goal.reason == "text_too_long" and not options.quiet:

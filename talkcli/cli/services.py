@@ -190,7 +190,7 @@ def _format_option(option: Option, value: object) -> str:
 
 
 def _find_inaccessible_file(files: Sequence[str]) -> tuple[str, str] | None:
-    """Return the first file that other users can't reach, and the directory that blocks them."""
+    """Find the first file that other users can't reach. Return the file and the blocking directory."""
     for path in files:
         steps = path.split(os.sep)
         for count in range(2, len(steps)):
@@ -210,12 +210,12 @@ def _quote_argument(word: str) -> str:
 
 
 def _escape_match(found: re.Match[str]) -> str:
-    """Return the matched characters as escapes for their bytes."""
+    """Return the matched characters as hexadecimal escapes."""
     return "".join(f"\\x{each:02x}" for each in os.fsencode(found[0]))
 
 
 def _escape_path(path: str) -> str:
-    """Escape a path for a systemd unit, or raise UsageError if a unit can't contain it."""
+    """Escape a path for a systemd unit. Raise UsageError if a unit can't contain it."""
     if re.search(_UNSAFE_CHARACTERS, path) or path.endswith(("\\", " ")):
         raise UsageError(
             f"a socket unit can't contain the path {printable(path)}; choose one without control characters"

@@ -55,7 +55,7 @@ def say(
 
         sentence = read_text(options.deadline(timeout), stop_without_reader=wait)
     if isinstance(sentence, int):
-        return sentence  # a signal or closed output has ended the reading
+        return sentence  # reading was interrupted by a signal or by closed output
     return _send_request(
         options, Say(replace_and_report_bad_bytes(sentence, options), wait=wait, **chosen), timeout, name
     )
@@ -104,7 +104,7 @@ def resume(options: CommonOptions) -> int:
 def _send_request(
     options: CommonOptions, request: Request, timeout: float | None = None, sender_name: str | None = None
 ) -> int:
-    """Send a request to the selected robots, print the outcomes, and return the exit code.
+    """Send a request to the selected robots, and print the outcomes. Return the exit code.
 
     After an interrupt or a timeout, cancel the goals if the command waits for goals that it has sent itself.
 
@@ -180,7 +180,7 @@ class _OutcomePrinter:
             self._clear_count()
 
     def _record_outcome(self, outcome: Outcome) -> None:
-        """Store a robot's outcome, but keep the first failure that it reported.
+        """Store a robot's outcome. Keep the first failure.
 
         An earlier failure is only replaced if it seemed to be final.
         """
@@ -250,7 +250,7 @@ def _failure_notes(failures: list[Outcome]) -> list[str]:
 
 
 def _join_names(names: list[str]) -> str:
-    """Join the first few names, and append the number of others."""
+    """Join the first few names. If there are more, add their number."""
     more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
     return ", ".join(names[:_MAX_NAMES]) + more
 

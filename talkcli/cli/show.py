@@ -128,7 +128,7 @@ class CommonOptions:
 
 
 def run_command(command: Callable[[], object], options: CommonOptions) -> int:
-    """Run a command, report its errors, and return its exit code.
+    """Run a command, and report its errors. Return its exit code.
 
     If the command returns a number, that is its exit code. Any other value means success.
     """
@@ -237,7 +237,7 @@ def retry_without_output(write: Callable[..., _T], *given: Any) -> _T:
 
 
 def standard_output() -> TextIO:
-    """Return `sys.stdout`, or raise BrokenPipeError if it is closed."""
+    """Return `sys.stdout`. Raise BrokenPipeError if it is closed."""
     if sys.stdout is None:
         raise BrokenPipeError("standard output is closed")
     return sys.stdout
@@ -266,7 +266,7 @@ def show_json(message: JsonObject) -> None:
 
 
 def show_result(options: CommonOptions, items: Iterable[JsonObject], lines: Callable[[], Iterable[str]]) -> None:
-    """Print `items` as JSON objects with --json, otherwise the lines that `lines` returns."""
+    """Print `items` as JSON with --json. Otherwise, print the lines from `lines`."""
     if options.json:
         for item in items:
             show_json(item)
@@ -390,7 +390,7 @@ def has_colour() -> bool:
 
 
 def screen(*, long: bool = False, boot: str = "") -> Screen:
-    """Return the properties of standard output as a Screen."""
+    """Return a Screen that describes standard output."""
     from talkcli.terminal.text import Screen
 
     if sys.stdout is None or not sys.stdout.isatty():

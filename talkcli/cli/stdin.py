@@ -54,7 +54,7 @@ _NO_LIMIT = float("inf")
 
 
 class InputTooLong(UsageError):
-    """Raised if standard input is longer than a text may be."""
+    """Raised if the text on standard input is too long."""
 
 
 def read_text(deadline: float | None, *, stop_without_reader: bool = False, any_length: bool = False) -> str | int:
@@ -149,7 +149,7 @@ class LineBuffer:
         return self._lines[0] if self._lines else None
 
     def take(self) -> InputLine:
-        """Remove and return the line that `first` returns."""
+        """Remove and return the first line that isn't blank."""
         return self._lines.popleft()
 
     def take_expired(self, now: float) -> Iterator[InputLine]:
@@ -164,7 +164,10 @@ class LineBuffer:
 
 
 def _read_available() -> bytes | None:
-    """Read the available data from standard input. Return b"" at the end, or None if there is no data yet."""
+    """Read available data from standard input. Return b"" at the end of the input.
+
+    Return None if there is no data yet.
+    """
     try:
         return os.read(0, _STDIN_READ_BYTES)
     except BlockingIOError:  # another program has made standard input non-blocking
@@ -260,7 +263,7 @@ class InputSpeaker:
         return None
 
     def _show_events(self, goal: GoalHandle) -> None:
-        """Show the goal's new events with --wait. Otherwise, forget them."""
+        """Show the goal's new events if --wait is given. Otherwise, discard them."""
         while event := goal.poll():
             if self._wait:
                 show_if_possible(self._feedback.show, goal.goal, event)
@@ -326,7 +329,7 @@ class LineSpeaker(InputSpeaker):
 
     @property
     def _done(self) -> bool:
-        """Whether there is nothing left to send or to wait for."""
+        """Whether all lines have been sent and no goals are left."""
         if self._wait and self._goals:
             return False
         return self._error is not None or not (self._unanswered or self._has_lines)
@@ -406,7 +409,7 @@ class LineSpeaker(InputSpeaker):
         self._unanswered = handle, self._connection.begin(request, accepted)
 
     def _process_answer(self) -> None:
-        """Process the server's answer to the last line, if it has arrived.
+        """Process the server's answer to the last line. Do nothing if it hasn't arrived.
 
         Follow an accepted goal.
         """
@@ -444,7 +447,7 @@ class LineSpeaker(InputSpeaker):
             self._record_failure(line.number, code)
 
     def _record_failure(self, line_number: int, exit_code: int) -> None:
-        """Record a line's exit code if it is the first failure."""
+        """Record a line's exit code. Later failures don't replace the first one."""
         if exit_code and (self._failure is None or line_number < self._failure[0]):
             self._failure = line_number, exit_code
 
@@ -480,7 +483,7 @@ class LineSpeaker(InputSpeaker):
                 wait(time.monotonic(), interruptible=False)
 
     def _report_and_forget_goals(self) -> None:
-        """Report events of the goals if --wait is given, and forget goals that have ended.
+        """Forget goals that have ended. With --wait, report their events first.
 
         Events are reported in the order of the lines.
         """
@@ -500,7 +503,7 @@ class LineSpeaker(InputSpeaker):
     # Stopping before the end of the input
 
     def _stop_early(self) -> None:
-        """Cancel the goals if --wait is given, and report the first unsent line."""
+        """Report the first unsent line. With --wait, cancel the goals first."""
         if self._wait:
             # Close the connection first. Otherwise, a line that is waiting for room in the queue would be accepted when
             # the other goals are cancelled.
@@ -510,7 +513,7 @@ class LineSpeaker(InputSpeaker):
         self._report_unsent()
 
     def _cancel_goals(self, ids: list[str]) -> None:
-        """Cancel these goals and any others of this process, and report how they ended."""
+        """Cancel the given goals and this process's other goals. Report how they ended."""
         self._options.urgent = True
         try:
             with self._options.connect(CANCEL_TIMEOUT_S, interrupt=self._interrupts.watched, end=None) as client:

@@ -29,7 +29,7 @@ _MAX_HELD_LINE_BREAKS = 100
 
 
 class InputDecoder:
-    """Decodes standard input as it arrives. The complete text is the same as for `talk say -`."""
+    """Decodes standard input as it arrives. The result is the same text as for `talk say -`."""
 
     def __init__(self) -> None:
         self._decoder = codecs.getincrementaldecoder("utf-8")("surrogateescape")
@@ -40,7 +40,7 @@ class InputDecoder:
         self.problem: str | None = None
 
     def decode(self, data: bytes) -> str:
-        """Decode the next bytes, and return the text that can be sent now.
+        """Decode the next bytes. Return the text that can be sent now.
 
         Empty bytes mark the end of the input.
         """
@@ -61,7 +61,7 @@ class StreamSpeaker(InputSpeaker):
     """Speaks standard input as one goal with a growing text."""
 
     def _run_connected(self) -> int:
-        """Wait for the first text, and send the goal and the rest of the input.
+        """Wait for the first text. Then send the goal and the rest of the input.
 
         Return the exit code.
         """

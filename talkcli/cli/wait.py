@@ -31,7 +31,7 @@ CANCEL_TIMEOUT_S = 1.0
 
 
 def seconds_left(deadline: float | None) -> float | None:
-    """Return the number of seconds left until a deadline, or None if there is none."""
+    """Return the number of seconds left until a deadline, if there is one."""
     return None if deadline is None else max(0.0, deadline - time.monotonic())
 
 
@@ -56,7 +56,7 @@ class GoalReporter:
             self.feedback = make_feedback(options)
 
     def show_accepted(self, goal: GoalHandle, pause_known: bool = False) -> None:
-        """Print the id of an accepted goal, and say if speech is paused.
+        """Print the id of an accepted goal. If speech is paused, say so.
 
         `pause_known` means that the user has already been told.
         """
@@ -83,7 +83,7 @@ class GoalReporter:
             show_if_possible(self.feedback.show, goal.goal, event)
 
     def report_refused(self, goal: Goal, prefix: str = "") -> int:
-        """Report a goal that wasn't accepted, and return its exit code.
+        """Report a goal that wasn't accepted. Return its exit code.
 
         `prefix` is put in front of any message.
         """
@@ -111,7 +111,7 @@ class GoalReporter:
         return goal.exit_code or EXIT_OK
 
     def cancel(self, goal: GoalHandle, interrupts: Interrupts) -> None:
-        """Cancel a goal, wait briefly for silence, and report how the goal ended.
+        """Cancel a goal, wait briefly for its end, and report the result.
 
         Output may fail, because Ctrl-C may also have ended the program that reads it, and SIGHUP means that the
         terminal is gone.

@@ -97,7 +97,7 @@ class BrokerExamination:
         self.question = BRIDGE_QUESTION if self._is_robot else ROBOT_QUESTION
 
     def findings(self) -> Iterator[Finding]:
-        """Run the checks, and yield their findings.
+        """Run the checks. Yield the findings.
 
         Stop at a failure that makes further checks impossible.
         """
@@ -134,7 +134,7 @@ class BrokerExamination:
             yield self._check_robot_server(broker)
 
     def _check_connection(self, broker: Broker, context: ssl.SSLContext | None) -> Iterator[Finding]:
-        """Connect to the broker, check its certificate, and yield the findings."""
+        """Connect to the broker, and check its certificate. Yield the findings."""
         began = time.monotonic()
         try:
             connection = self._wait_for(partial(socket.create_connection, (broker.host, broker.port), LOGIN_LIMIT_S))
@@ -155,7 +155,7 @@ class BrokerExamination:
             yield judge_certificate(broker, expires_at, time.time())
 
     def _log_in(self, broker: Broker) -> Link:
-        """Log in to the broker, and return the open connection.
+        """Log in to the broker. Return the open connection.
 
         Raises the same errors as `Link.open`.
         """
@@ -168,7 +168,7 @@ class BrokerExamination:
         return link
 
     def _check_anonymous(self, broker: Broker) -> Finding:
-        """Return a finding on whether the broker accepts a login without credentials."""
+        """Check whether the broker accepts a login without credentials. Return the finding."""
         try:
             self._log_in(replace(broker, user=None, password=None, cert=None, key=None)).close()
         except TalkError:
@@ -181,7 +181,7 @@ class BrokerExamination:
         )
 
     def _test_rights(self, link: Link, user: str) -> tuple[Finding, dict[str, Presence]]:
-        """Test the user's access rights, and return the finding and the robots' presence messages.
+        """Test the user's access rights. Return the finding and the robots' presence messages.
 
         The user needs the rights of an operator, or those of
         this robot's bridge. Other robots are only read if this robot's presence is missing, and the user isn't the
@@ -224,7 +224,7 @@ class BrokerExamination:
         return judge_rights(user, unwritable, unreadable, trouble), presences
 
     def _check_robot_server(self, broker: Broker) -> Finding:
-        """Request the status of the robot's server, and return the finding about the answer."""
+        """Request the status of the robot's server. Return the finding."""
         end = time.monotonic() + _STEP_LIMIT_S
         try:
             connection = connect_robot(
@@ -240,7 +240,7 @@ class BrokerExamination:
             return failure("bridge", wrong, remedy or step)
 
     def _wait_for(self, function: Callable[[], _Result]) -> _Result:
-        """Run a blocking function in a thread. Return its result, or raise TimeoutError.
+        """Run a blocking function in a thread. Return its result.
 
         Raises:
             TimeoutError: The work takes too long. The thread continues, but its result is ignored.
@@ -264,7 +264,7 @@ class BrokerExamination:
 
 
 def _read_expiry(connection: socket.socket, context: ssl.SSLContext, host: str) -> float:
-    """Start TLS, and return when the broker's certificate expires, in seconds since 1970."""
+    """Start TLS. Return the certificate's expiry time, in seconds since 1970."""
     with context.wrap_socket(connection, server_hostname=host) as secured:
         return ssl.cert_time_to_seconds(str((secured.getpeercert() or {})["notAfter"]))
 
@@ -283,7 +283,7 @@ def _explain_error(error: OSError | UnicodeError) -> str:
 
 
 def judge_settings(message: str, *, has_url: bool) -> Finding:
-    """Return the finding about broker settings that are invalid or lack the URL.
+    """Create the finding for invalid or missing broker settings.
 
     Args:
         message: the error message.
@@ -295,7 +295,7 @@ def judge_settings(message: str, *, has_url: bool) -> Finding:
 
 
 def judge_unreachable(broker: Broker, reason: str) -> Finding:
-    """Return the finding about a broker that can't be reached.
+    """Create the finding for a broker that can't be reached.
 
     `reason` is a text of `_explain_error`.
     """
@@ -304,7 +304,7 @@ def judge_unreachable(broker: Broker, reason: str) -> Finding:
 
 
 def judge_certificate(broker: Broker, expires_at: float | None, now: float) -> Finding:
-    """Return the finding about the expiry of the broker's certificate, or about missing TLS.
+    """Check when the broker's certificate expires, and whether TLS is used. Return the finding.
 
     Args:
         broker: the broker.
@@ -324,7 +324,7 @@ def judge_certificate(broker: Broker, expires_at: float | None, now: float) -> F
 
 
 def judge_tls_error(broker: Broker, message: str, verify_code: int, now: float) -> Finding:
-    """Return the finding about a failed TLS connection.
+    """Create the finding for a failed TLS connection.
 
     Args:
         broker: the broker.
@@ -337,7 +337,7 @@ def judge_tls_error(broker: Broker, message: str, verify_code: int, now: float) 
 
 
 def _describe_cas(broker: Broker) -> str:
-    """Return a description of the CAs that the broker's certificate is checked against."""
+    """Describe the CAs that should have signed the broker's certificate."""
     return f"the CA in {broker.ca}" if broker.ca else "the system's CAs"
 
 
@@ -360,7 +360,7 @@ def _advise_on_tls_error(broker: Broker, message: str, verify_code: int, now: fl
 
 
 def judge_login(broker: Broker, refusal: str | None) -> Finding:
-    """Return the finding about the login, which succeeded if `refusal` is None.
+    """Create the finding for a login. The login succeeded if `refusal` is None.
 
     `refusal` is the broker's reason for refusing it, or None.
     """
@@ -380,7 +380,7 @@ def judge_login(broker: Broker, refusal: str | None) -> Finding:
 
 
 def judge_presence(presence: Presence, now: float) -> Finding:
-    """Return the finding on whether a robot and its server are online."""
+    """Check whether a robot and its server are online. Return the finding."""
     robot = presence.name
     if not presence.online:
         step = f"check its network and power; on {robot}, run: systemctl status talk-bridge"
@@ -398,7 +398,7 @@ def judge_presence(presence: Presence, now: float) -> Finding:
 
 
 def judge_unknown_robot(robot: str, known_robots: list[str], user: str, *, has_other_rights: bool) -> Finding:
-    """Return the finding about a robot that the broker doesn't know.
+    """Create the finding for a robot that the broker doesn't know.
 
     Args:
         robot: the robot's name.
@@ -421,7 +421,7 @@ def judge_unknown_robot(robot: str, known_robots: list[str], user: str, *, has_o
 
 
 def judge_rights(user: str, unwritable: tuple[str, ...], unreadable: tuple[str, ...], error: str | None) -> Finding:
-    """Return the finding about the user's access rights to the broker's topics.
+    """Check the user's access rights to the broker's topics. Return the finding.
 
     Args:
         user: the user's name.
@@ -441,7 +441,7 @@ def judge_rights(user: str, unwritable: tuple[str, ...], unreadable: tuple[str, 
 
 
 def judge_server_status(robot: str, server: JsonObject, response_s: float) -> Finding:
-    """Return the finding about the status of the robot's server."""
+    """Check the status of the robot's server. Return the finding."""
     words = f"{robot} answered in {response_s * 1000:.0f} ms: {summarize_server(server)}"
     if server.get("paused") is True:
         return warning("bridge", f"speech is paused; {words}", f"talk --robot {robot} resume")

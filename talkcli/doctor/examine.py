@@ -65,7 +65,7 @@ class LocalExamination:
         self._findings: list[Finding] = []
 
     def findings(self) -> Iterator[Finding]:
-        """Run all checks, and yield each finding as soon as it is known."""
+        """Run all checks. Yield each finding as soon as it is known."""
         client, socket = server.connect(self._socket, self._interrupt)
         with client or contextlib.nullcontext():
             for each in self._run_checks(client, socket):
@@ -74,7 +74,7 @@ class LocalExamination:
                 yield finding
 
     def _run_checks(self, client: Client | None, socket_finding: Finding) -> Iterator[Finding]:
-        """Run all checks with the client, if there is one, and yield their findings.
+        """Run all checks, with a client if the server is running. Yield the findings.
 
         The arguments are the results of `server.connect`.
         """
@@ -106,7 +106,7 @@ class LocalExamination:
         yield self._speak_sentence()
 
     def _setting(self, name: str, variable: str = "") -> str | None:
-        """Return a server setting, or an environment variable if there is no server.
+        """Return a setting of the server. Without a server, return an environment variable.
 
         Return None if it isn't set.
         """
@@ -115,7 +115,7 @@ class LocalExamination:
 
     @property
     def _player(self) -> str | None:
-        """The player that was configured, or None if the engine chooses one."""
+        """The configured player. It is None if the engine chooses one."""
         return self._setting("player", "TALK_PLAYER")
 
     def _check_neural(self) -> Iterator[Finding]:
@@ -138,7 +138,10 @@ class LocalExamination:
         yield from voice.check_neural(used, options, SENTENCE_LIMIT_S, server_voices if self._client else None)
 
     def _check_sound(self) -> Iterator[Finding]:
-        """Yield findings about the sound output, and record whether the sound server hangs."""
+        """Check the sound output. Yield the findings.
+
+        Record whether the sound server hangs.
+        """
         env, session, device, by_server = self._env, self._session, self._setting("device"), self._client is not None
         if not is_own_driver(self._setting("driver")):
             return  # pyttsx3's other drivers play the sound themselves
@@ -162,7 +165,7 @@ class LocalExamination:
         yield from sound.check_levels(env, sound_server, cards, in_use=device is None and used in PLAYERS)
 
     def _speak_sentence(self) -> Finding:
-        """Speak the doctor's test sentence, and return the finding about it."""
+        """Speak the doctor's test sentence. Return the finding."""
         client, engine, player = self._client, self._engine, self._player
         if client is not None and self._silent:
             if self._server_pid is None:

@@ -43,7 +43,7 @@ class Finding:
 
 @frozen
 class Question:
-    """The question that an examination answers, with all possible answers."""
+    """The question that the doctor answers, with both possible answers."""
 
     #: the human-readable answers
     yes: str
@@ -64,12 +64,12 @@ def ok(check: str, message: str) -> Finding:
 
 
 def warning(check: str, message: str, step: str) -> Finding:
-    """Return a finding about a fault that may prevent sound, with the user's next step."""
+    """Return a finding for a fault that may prevent sound. `step` is the advice for the user."""
     return Finding(check, WARNING, printable(message), printable(step))
 
 
 def failure(check: str, message: str, step: str) -> Finding:
-    """Return a finding about a fault that certainly prevents sound, with the user's next step."""
+    """Return a finding for a fault that certainly prevents sound. `step` is the advice for the user."""
     return Finding(check, FAILURE, printable(message), printable(step))
 
 

@@ -1,4 +1,4 @@
-"""The check that speaks a sentence, through the server or with the doctor's own engine.
+"""The check that speaks a sentence through the server or the doctor's own engine.
 
 The server treats the sentence like any other goal.
 """
@@ -95,7 +95,7 @@ class SentenceResult:
 
 
 def speak_by_server(client: Client, text: str, limit: float) -> SentenceResult:
-    """Speak a sentence through the server, and return how it ended.
+    """Speak a sentence through the server. Return how it ended.
 
     Cancel it after `limit` seconds.
     """
@@ -118,7 +118,7 @@ def speak_by_server(client: Client, text: str, limit: float) -> SentenceResult:
 
 
 def _cancel_late_goal(client: Client, goal: GoalHandle, limit: float) -> SentenceResult:
-    """Cancel a goal that took too long, and return a result that explains the delay."""
+    """Cancel a goal that took too long. Return a result that explains the delay."""
     before = client.status()
     ended = goal.cancel()
     if ended.state in {State.SUCCEEDED, State.ABORTED}:  # the goal ended before it could be cancelled
@@ -142,7 +142,7 @@ def _convert_ended_goal(goal: Goal) -> SentenceResult:
 
 
 def speak_beside_server(client: Client, options: EngineOptions, limit: float) -> SentenceResult:
-    """Speak a sentence at zero volume. Return its result, which shows if the server spoke at the same time.
+    """Speak a sentence at zero volume. The result shows whether the server spoke meanwhile.
 
     The doctor's own engine speaks the sentence.
     """
@@ -158,7 +158,7 @@ def speak_beside_server(client: Client, options: EngineOptions, limit: float) ->
 
 
 def speak_by_engine(text: str, options: EngineOptions, volume: float, limit: float) -> SentenceResult:
-    """Speak a sentence with the doctor's own engine, and return how it ended.
+    """Speak a sentence with the doctor's own engine. Return how it ended.
 
     Give up after `limit` seconds.
     """
@@ -192,7 +192,7 @@ def find_playback_step(findings: Sequence[Finding], *, custom_player: bool = Fal
 def advise(
     reason: str | None, message: str | None, player: object = None, device: object = None, text: str | None = None
 ) -> str:
-    """Return advice for a goal that ended for this reason.
+    """Return advice for a goal, based on its reason and message.
 
     Args:
         reason: the goal's reason.
@@ -222,7 +222,7 @@ def advise(
 def judge_sentence(
     result: SentenceResult, *, silent: bool, device: object, playback_step: str | None = None, sound_hangs: bool = False
 ) -> Finding:
-    """Return the finding about how the doctor's test sentence ended.
+    """Check how the doctor's test sentence ended. Return the finding.
 
     Args:
         result: how the sentence ended.

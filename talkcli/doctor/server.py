@@ -74,7 +74,7 @@ _FAINT_VOLUME = 0.2
 
 @frozen
 class SocketPlace:
-    """The result of examining a path at which a server may listen."""
+    """The result of probing a path where a server may listen."""
 
     path: str
     #: one of the PLACE texts, or the system's error message
@@ -107,7 +107,7 @@ def connect(socket_option: str | None, interrupt: Mapping[int, int] | None) -> t
 
 
 def _find_refusal(error: TalkError, places: list[SocketPlace]) -> str | None:
-    """Return the line of an error message that says why the client was refused, or None."""
+    """Find the line of an error message that says why a client was refused. Return the line, if any."""
     lines = error.message.splitlines()
     if not lines[0].startswith(_NO_SERVER_PREFIX):
         return lines[0]
@@ -116,7 +116,7 @@ def _find_refusal(error: TalkError, places: list[SocketPlace]) -> str | None:
 
 
 def _probe_path(path: str, trusted_paths: Container[str | None]) -> SocketPlace:
-    """Connect to a socket path, and return what was found there."""
+    """Connect to a socket path. Return what was found there."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
@@ -150,7 +150,7 @@ def request_status_and_log(client: Client) -> tuple[JsonObject, list[Goal]]:
 
 
 def local_pid(client: Client) -> int | None:
-    """Return the server's process id, or None if the server runs elsewhere.
+    """Return the server's process id. Return None if the server runs elsewhere.
 
     The server's socket may be forwarded by ssh, for example. If systemd created the socket, the kernel reports systemd
     as the listening process.
@@ -161,7 +161,7 @@ def local_pid(client: Client) -> int | None:
 
 
 def judge_found_server(message: str, earlier_places: list[SocketPlace]) -> Finding:
-    """Return the finding about a server's socket and the places that clients try before it.
+    """Check the places that clients try before a server's socket. Return the finding.
 
     Args:
         message: the description of the server's socket.
@@ -175,7 +175,7 @@ def judge_found_server(message: str, earlier_places: list[SocketPlace]) -> Findi
 
 
 def explain_missing_server(places: list[SocketPlace], named_by: str | None, error: TalkError) -> Finding:
-    """Return the finding that no server was found, with advice.
+    """Create the finding for a missing server, with advice.
 
     Args:
         places: the places that were tried.
@@ -191,7 +191,7 @@ def explain_missing_server(places: list[SocketPlace], named_by: str | None, erro
 
 
 def _format_place(place: SocketPlace) -> str:
-    """Describe a path and the result of examining it."""
+    """Describe a socket path and what was found there."""
     whose = "" if place.uid is None or place.state not in {PLACE_FOREIGN, PLACE_FORBIDDEN} else f" (uid {place.uid})"
     return f"{place.path}: {place.state}{whose}"
 
@@ -229,12 +229,12 @@ def _advise_on_missing_server(places: list[SocketPlace], named_by: str | None, e
 
 
 def judge_unresponsive_server(message: str) -> Finding:
-    """Return the finding about a server that accepted the connection but didn't answer."""
+    """Create the finding for a server that accepted the connection but didn't answer."""
     return failure("server", message, "read its log, and restart it: talk serve")
 
 
 def judge_server(server: JsonObject, log: Sequence[Goal], now: float) -> list[Finding]:
-    """Return the findings about the server's state, settings and recent failures.
+    """Check the server's state, settings and recent failures. Return the findings.
 
     Args:
         server: the server's description of itself.
@@ -245,7 +245,7 @@ def judge_server(server: JsonObject, log: Sequence[Goal], now: float) -> list[Fi
 
 
 def _judge_state(server: JsonObject) -> Finding:
-    """Return the finding about a server's state."""
+    """Check the server's state. Return the finding."""
     version, words = server.get("version"), summarize_server(server)
     if server.get("paused") is True:
         return failure("server", f"speech is paused; {words}", "talk resume")
@@ -267,7 +267,7 @@ def summarize_server(server: JsonObject) -> str:
 
 
 def _judge_settings(server: JsonObject) -> Finding:
-    """Return the finding about a server's settings.
+    """Check the server's settings. Return the finding.
 
     It is a warning or failure if the volume is too low.
     """
@@ -281,7 +281,7 @@ def _judge_settings(server: JsonObject) -> Finding:
 
 
 def _judge_recent_goals(goals: Sequence[Goal], now: float, server: JsonObject) -> Finding:
-    """Return the finding about failures of recent goals.
+    """Check recent goals for failures. Return the finding.
 
     It is a warning if no goal has succeeded since the last failure.
     """

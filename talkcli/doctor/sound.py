@@ -93,7 +93,7 @@ class UserSession:
 
 @frozen
 class ProgramOutput:
-    """A program's output, with the reason if it failed."""
+    """The output of a program, and the error if the program failed."""
 
     #: why the program failed, or None if it succeeded
     error: str | None
@@ -156,7 +156,7 @@ def names_a_player(server_pid: int, env: Mapping[str, str]) -> bool:
 
 
 def file_owner(path: str) -> int | None:
-    """Return the user id of a file's owner, or None if the file doesn't exist.
+    """Return the user id of a file's owner. Return None if the file doesn't exist.
 
     The owner of /proc/PID is the user who runs the process.
     """
@@ -166,7 +166,7 @@ def file_owner(path: str) -> int | None:
 
 
 def _read_environment(pid: int) -> dict[str, str] | None:
-    """Return the environment of another process, or None if another user runs the process."""
+    """Return the environment of another process. Return None if another user runs the process."""
     data = read_proc_file(f"/proc/{pid}/environ", -1)
     if data is None or file_owner(f"/proc/{pid}") != os.getuid():
         return None  # root could read the environment, but can't use another user's sound server
@@ -185,7 +185,7 @@ def _name_or_id(look_up: Callable[[int], tuple[Any, ...]], number: int) -> str:
 
 
 def _group_ids(pid: int) -> tuple[int, ...]:
-    """Return the group ids of a process, or those of this process if /proc can't be read."""
+    """Return the group ids of a process. If /proc can't be read, return this process's ids."""
     status = _read_proc_text(f"/proc/{pid}/status")
     found = re.search(r"^Gid:\s+\d+\s+(\d+).*?^Groups:([\d \t]*)$", status, re.MULTILINE | re.DOTALL)
     groups = map(int, " ".join(found.groups()).split()) if found else (os.getegid(), *os.getgroups())
@@ -193,7 +193,7 @@ def _group_ids(pid: int) -> tuple[int, ...]:
 
 
 def _find_origins(environment: Mapping[str, str], pid: int) -> Iterable[str]:
-    """Yield descriptions of what started a process, most specific first."""
+    """Find out how a process was started. Yield descriptions, the most specific first."""
     if environment.get("container") or any(map(os.path.exists, _CONTAINER_FILES)):
         yield _CONTAINER
     unit = re.search(r"system\.slice/(?:[^\n]*/)?([^/\n]+)\.service", _read_proc_text(f"/proc/{pid}/cgroup"))
@@ -242,12 +242,12 @@ def _read_acl(path: str) -> list[tuple[int, int, int]]:
 
 
 def _read_proc_text(path: str) -> str:
-    """Return the text of a file in /proc, or "" if it can't be read."""
+    """Return the text of a file in /proc. Return "" if it can't be read."""
     return (read_proc_file(path, -1) or b"").decode(errors="replace")
 
 
 def run_program(program: str, *arguments: str, env: Mapping[str, str], limit: float | None = None) -> ProgramOutput:
-    """Run a program in the C locale with a time limit, and return its output.
+    """Run a program in the C locale with a time limit. Return its output.
 
     The default limit is PROGRAM_LIMIT_S.
     """
@@ -288,7 +288,7 @@ def is_custom(player: str | None) -> bool:
 
 
 def _program_of(command: str) -> str | None:
-    """Return the program in a player's command line, or None if the line can't be parsed."""
+    """Return the program in a player's command line. Return None if the line can't be parsed."""
     try:
         return next(iter(shlex.split(command)), None)
     except ValueError:
@@ -332,14 +332,14 @@ DEVICE_LISTS: dict[str, tuple[str, Callable[[ProgramOutput], Iterable[str]], str
 
 
 def add_pactl_hint(finding: Finding, env: Mapping[str, str]) -> Finding:
-    """Return the finding. If its advice needs pactl and pactl is missing, add an installation hint."""
+    """Add an installation hint to a finding if its advice needs pactl. Return the finding."""
     if finding.next is None or "pactl " not in finding.next or on_path("pactl", env):
         return finding
     return replace(finding, next=f"{finding.next} (to install pactl: sudo apt-get install -y {PACKAGES['pacat']})")
 
 
 def suspended_sinks(env: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the names of suspended sinks, including idle ones."""
+    """Return the names of the sinks that the sound server has suspended."""
     sinks = _parse_pulse_sinks(run_program(*_LIST_SINKS.split(), env=env))
     return tuple(name for name, state in sinks.items() if state == "SUSPENDED")
 
@@ -366,7 +366,7 @@ def find_sound_server(env: Mapping[str, str], session: UserSession) -> SoundServ
 
 
 def _find_pulse_address(env: Mapping[str, str]) -> str | None:
-    """Return the address of a server that accepts PulseAudio clients, or None if there is none.
+    """Return the address of a server that accepts PulseAudio clients, if there is one.
 
     An address on another machine isn't tested. The sentence will show whether it works.
     """
@@ -400,7 +400,7 @@ def check_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[st
 
 
 def _read_levels(env: Mapping[str, str], sound_server: SoundServer, cards: Sequence[str]) -> Iterable[tuple[str, ...]]:
-    """Yield the name, the level and the mixer commands of each output, for `judge_level`."""
+    """Read the volume of each output. Yield the arguments for `judge_level`."""
     if sound_server.name is not None:
         mute = run_program("pactl", "get-sink-mute", "@DEFAULT_SINK@", env=env)
         if mute.error is None:
@@ -419,7 +419,7 @@ def _read_levels(env: Mapping[str, str], sound_server: SoundServer, cards: Seque
 
 
 def judge_level(name: str, mixer_output: str, unmute_command: str, louder_command: str, *, in_use: bool) -> Finding:
-    """Return the finding about the volume of one output.
+    """Check the volume of one output. Return the finding.
 
     If its channels differ, the loudest one counts.
 
@@ -448,7 +448,7 @@ def judge_level(name: str, mixer_output: str, unmute_command: str, louder_comman
 
 
 def judge_session(session: UserSession) -> Finding:
-    """Return the finding about the user session."""
+    """Check the user session. Return the finding."""
     who = "" if session.server_pid is None else "the server runs as "
     who += f"user {session.user} (uid {session.uid})"
     who += "" if session.sudo_uid is None else f" through sudo by uid {session.sudo_uid}"
@@ -476,7 +476,7 @@ def judge_session(session: UserSession) -> Finding:
 
 
 def judge_silent_player(player: str | None, *, set_by_server: bool) -> Finding:
-    """Return the finding about a configured player that makes no sound."""
+    """Create the finding for a configured player that makes no sound."""
     step = "restart the server without --player" if set_by_server else "unset TALK_PLAYER"
     return failure("player", f"{player} ({_describe_player_setting(set_by_server)}) makes no sound", step)
 
@@ -487,7 +487,7 @@ def _describe_player_setting(set_by_server: bool) -> str:
 
 
 def check_player(env: Mapping[str, str], configured: str | None, used: str | None, *, by_server: bool) -> Finding:
-    """Check whether the player of the server or the doctor is installed, and return the finding.
+    """Check whether the player is installed. Return the finding.
 
     Args:
         env: the environment of the player.
@@ -516,7 +516,7 @@ def check_player(env: Mapping[str, str], configured: str | None, used: str | Non
 
 
 def check_device(env: Mapping[str, str], player: str, configured: str | None) -> Finding:
-    """Check whether the player has the configured device, and return the finding.
+    """Check whether the player has the configured device. Return the finding.
 
     Args:
         env: the environment of the player.
@@ -547,7 +547,7 @@ def check_device(env: Mapping[str, str], player: str, configured: str | None) ->
 
 
 def check_cards(cards: Sequence[str], sound_server: SoundServer, session: UserSession) -> Finding:
-    """Return the finding on whether the kernel has found any sound cards."""
+    """Check whether the kernel has found any sound cards. Return the finding."""
     if cards:
         return ok("cards", join_names(cards))
     if sound_server.name is not None and sound_server.default_sink != DUMMY_SINK:
@@ -561,7 +561,7 @@ def check_cards(cards: Sequence[str], sound_server: SoundServer, session: UserSe
 
 
 def check_access(sound_server: SoundServer, session: UserSession, directory: str = "/dev/snd") -> Finding:
-    """Check whether the user may open the sound cards, and return the finding."""
+    """Check whether the user may open the sound cards. Return the finding."""
     nodes, group, forbidden = players.playback_devices(directory), _AUDIO_GROUP, []
     for each in nodes:
         with contextlib.suppress(OSError):
@@ -588,7 +588,7 @@ def check_access(sound_server: SoundServer, session: UserSession, directory: str
 def judge_sound_server(
     server: SoundServer, cards: Sequence[str], session: UserSession, player: str | None = None
 ) -> Finding:
-    """Return the finding about the sound server.
+    """Check the sound server. Return the finding.
 
     Without one, it is a warning if `player` needs a sound server.
     """

@@ -112,14 +112,14 @@ class VoiceTrial:
 
 
 def installed_version(package: str) -> str | None:
-    """Return the version of a package without importing it, or None if it isn't installed."""
+    """Return the version of a package without importing it. Return None if it isn't installed."""
     with contextlib.suppress(PackageNotFoundError):
         return version(package)
     return None
 
 
 def start_engine(options: EngineOptions, limit: float = math.inf, wav_fd: int | None = None) -> PrivateEngine:
-    """Start an engine process, and return the object that controls it.
+    """Start an engine process. Return the object that controls it.
 
     Args:
         options: the options of the engine.
@@ -136,7 +136,7 @@ def start_engine(options: EngineOptions, limit: float = math.inf, wav_fd: int | 
 
 
 def probe_engine(options: EngineOptions) -> EngineReport:
-    """Start and end an engine process, and return its report."""
+    """Start and end an engine process. Return its report."""
     ready = None
     try:
         with start_engine(options) as engine:
@@ -160,12 +160,12 @@ def explain_failure(error: EngineFailed) -> tuple[str, str]:
 
 
 def judge_python() -> Finding:
-    """Return a finding that names the Python interpreter."""
+    """Create the finding that names the Python interpreter."""
     return ok("python", f"Python {platform.python_version()} ({sys.executable})")
 
 
 def judge_engine(pyttsx3_version: str | None, report: EngineReport, *, server_engine: str | None) -> list[Finding]:
-    """Return the findings about pyttsx3, libespeak-ng and the voices.
+    """Check pyttsx3, libespeak-ng and the voices. Return the findings.
 
     Args:
         pyttsx3_version: version of pyttsx3, or None if it is not installed.
@@ -195,7 +195,7 @@ def judge_engine(pyttsx3_version: str | None, report: EngineReport, *, server_en
 
 
 def _judge_library(library_version: str | None, voices: tuple[str, ...] | None) -> list[Finding]:
-    """Return the findings about libespeak-ng and the engine's voices."""
+    """Check libespeak-ng and the engine's voices. Return the findings."""
     found = [] if library_version is None else [ok("libespeak-ng", f"{library_version}, with its data")]
     if voices is None:
         return [*found, warning("voices", "the engine did not list its voices in time", "run talk doctor again")]
@@ -208,7 +208,7 @@ def _judge_library(library_version: str | None, voices: tuple[str, ...] | None) 
 def check_neural(
     used_voice: str | None, options: EngineOptions, limit: float, server_voices: dict[str, Any] | None
 ) -> Iterator[Finding]:
-    """Check the packages and files of neural voices, try the voice in use, and yield findings.
+    """Check neural voices: the packages, the files and the voice in use. Yield the findings.
 
     Args:
         used_voice: the voice in use, as the user wrote it, or None if no neural voice is in use.
@@ -229,7 +229,7 @@ def check_neural(
 
 
 def _check_voice_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
-    """Check the files of all installed neural voices, and yield a finding."""
+    """Check the files of all installed neural voices. Yield a finding."""
     valid, invalid = [], []
     for name, path in models.find_models(env).items():
         try:
@@ -249,7 +249,7 @@ def _check_voice_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
 
 
 def _find_package_fault(env: Mapping[str, str]) -> tuple[str, str] | None:
-    """Return why a package for neural voices can't be imported, and advice. Return None if nothing is wrong."""
+    """Find a package for neural voices that can't be imported. Return the fault and the advice, if any."""
     missing = models.missing_package()
     if missing is not None:
         return _split_advice(missing)
@@ -302,7 +302,10 @@ def _try_voice(voice: str, options: EngineOptions, limit: float) -> VoiceTrial:
 
 
 def _speak(engine: PrivateEngine, voice: str, text: str) -> tuple[protocol.Ended, float | None]:
-    """Speak a text. Return its `Ended` event, and the voice's loading time if the voice was loaded."""
+    """Speak a text. Return its `Ended` event and the time taken to load the voice.
+
+    The time is None if the voice was already loaded.
+    """
     load_s = None
     # Set `voice_only`, because otherwise espeak would speak if the voice isn't loaded.
     engine.speak(protocol.Speak(text, text, SENTENCE_RATE_WPM, 1.0, voice, 50, voice_only=True))
@@ -315,13 +318,13 @@ def _speak(engine: PrivateEngine, voice: str, text: str) -> tuple[protocol.Ended
 
 
 def _memory_of(pid: int) -> int | None:
-    """Return the resident memory of a process in bytes, or None if it is unknown."""
+    """Return the resident memory of a process in bytes. Return None if it is unknown."""
     statm = read_proc_file(f"/proc/{pid}/statm")  # the second number is the count of resident pages
     return int(statm.split()[1]) * os.sysconf("SC_PAGE_SIZE") if statm else None
 
 
 def judge_server_voices(voices: dict[str, Any]) -> list[Finding]:
-    """Return the findings about the server's neural voices, without examining files.
+    """Check the state of the server's neural voices. Return the findings.
 
     `voices` is the server's description of its neural voices.
     """
@@ -333,7 +336,7 @@ def judge_server_voices(voices: dict[str, Any]) -> list[Finding]:
 
 
 def judge_trial(voice: str, trial: VoiceTrial, server_voices: dict[str, Any] | None) -> Finding:
-    """Return the finding about the trial of a neural voice.
+    """Check how a neural voice performed in a trial. Return the finding.
 
     The other arguments are those of `check_neural`.
     """

@@ -118,7 +118,7 @@ class Fleet:
         return self._send_request(to, Cancel(None if ids is None else tuple(ids), current, before, key))
 
     def wait(self, to: str, ids: Iterable[str] | None = None) -> FleetRequest:
-        """Return a request that waits for the given goals, or for all current goals, on each robot."""
+        """Return a request that waits for some or all goals on each robot."""
         return self._send_request(to, Wait(None if ids is None else tuple(ids)))
 
     def status(self, to: str) -> FleetRequest:

@@ -59,7 +59,7 @@ class Broker:
         return f"{'mqtts' if self.tls else 'mqtt'}://{host}:{self.port}"
 
     def ssl_context(self) -> ssl.SSLContext | None:
-        """Create an SSL context, or return None if the connection doesn't use TLS.
+        """Create an SSL context if the connection uses TLS.
 
         Raises:
             UsageError: a certificate or key file is unusable.
@@ -115,7 +115,7 @@ def require_paho() -> None:
 
 
 def client_user(broker: Broker) -> str:
-    """Return the user name that appears in topics: the login's name, or else the local user's name.
+    """Return the user name for topics. It is the login's name or the local user's name.
 
     Raises:
         UsageError: the name isn't allowed in a topic.
@@ -132,7 +132,7 @@ def client_user(broker: Broker) -> str:
 
 
 def _parse_url(url: str) -> tuple[str, int, bool]:
-    """Split a broker's URL into the host, the port, and whether to use TLS.
+    """Parse a broker's URL. Return the host, the port and whether to use TLS.
 
     Error messages don't show the whole URL, because it may contain a password.
 
@@ -189,7 +189,7 @@ def is_local(host: str) -> bool:
 
 
 def _refuse_passphrase() -> str:
-    """Raise UsageError when OpenSSL asks for the passphrase of a key."""
+    """Raise UsageError. OpenSSL calls this function if a key has a passphrase."""
     raise UsageError("the key has a passphrase, which talk can't ask for; use a key without a passphrase")
 
 

@@ -280,7 +280,7 @@ class Link:
                 self._socket = None
 
     def drop(self) -> None:
-        """Close a forked child's copy of the descriptor, without ending the connection."""
+        """Close a forked child's copy of the socket. The parent's connection stays open."""
         if self._socket is not None:
             os.close(self._socket.detach())
 
@@ -291,7 +291,7 @@ class Link:
         return isinstance(self._socket, ssl.SSLSocket) and self._socket.pending() > 0
 
     def _login_error(self) -> TalkError | None:
-        """Return an error if the login failed, or None if it succeeded."""
+        """Return an error if the login failed."""
         url, answer = self._broker.url, self._answer
         if answer is None and self._broker.tls and (self._alert or self.ended):
             # With TLS 1.3, the client finishes its handshake before the broker checks the client's certificate. If the
@@ -330,20 +330,20 @@ class Link:
         self._socket = None  # paho closes it
 
     def _on_message(self, _client: paho.Client, _data: object, message: paho.MQTTMessage) -> None:
-        """Convert paho's message to a Message, and pass it to the caller's `on_message`."""
+        """Convert a message from paho, and pass it to `on_message`."""
         names = "ResponseTopic", "CorrelationData", "MessageExpiryInterval"
         properties = [getattr(message.properties, each, None) for each in names]
         self._deliver(Message(message.topic, bytes(message.payload), message.retain, *properties))
 
     def _on_publish(self, _client: paho.Client, _data: object, mid: int, code: ReasonCode, _: object) -> None:
-        """Call the callback of a message that the broker has acknowledged."""
+        """Call a message's `on_acknowledged` function with the broker's reason code."""
         size, on_acknowledged = self._unacknowledged.pop(mid, (0, None))
         self.outstanding_bytes -= size
         if on_acknowledged:
             on_acknowledged(code.value)
 
     def _on_log(self, _client: paho.Client, _data: object, _level: int, text: str) -> None:
-        """Store the TLS alert from a line that paho logs during the login."""
+        """Store a TLS alert that paho logs during the login."""
         # With TLS 1.3, the broker's alert about a missing certificate arrives in the first read, and paho only logs it.
         if "ALERT" in text and self._answer is None:
             self._alert = text.rpartition("] ")[2].partition(" (")[0]
@@ -382,14 +382,14 @@ class LinkOpener:
         threading.Thread(target=self._open, name="talk: connecting", daemon=True).start()
 
     def cancel(self) -> None:
-        """Close the link at once, or as soon as it has opened."""
+        """Close the link. If it is still being opened, close it afterwards."""
         with self._lock:
             self._canceled = True
             if self.done:
                 self.link.close()
 
     def _open(self) -> None:
-        """Open the link, and store any error. Then call `on_done`, or close the link if opening was cancelled."""
+        """Open the link, and store any error. Then call `on_done`, or close a cancelled link."""
         try:
             self.link.open()
         except TalkError as error:

@@ -60,7 +60,7 @@ class Presence:
 
     @classmethod
     def read(cls, name: str, payload: bytes) -> Presence | None:
-        """Parse a presence message, or return None if it is invalid.
+        """Parse a presence message. Return None if it is invalid.
 
         An empty payload, which clears a retained presence, also counts as invalid.
         """
@@ -77,7 +77,7 @@ class Presence:
 
 
 def bridge_rank(presence: Presence | None) -> tuple[float, str] | None:
-    """Return a bridge's rank among the bridges of one robot, or None if the bridge is offline.
+    """Return a bridge's rank among the bridges of one robot. Return None if it is offline.
 
     The bridge with the lowest rank keeps the robot's name. The others exit.
     """
@@ -114,7 +114,7 @@ class RobotStatus:
 
     @classmethod
     def read(cls, payload: bytes) -> RobotStatus | None:
-        """Parse a status message, or return None if it is invalid."""
+        """Parse a status message. Return None if it is invalid."""
         said = _decode_object(payload)
         if said is None:
             return None
@@ -124,7 +124,7 @@ class RobotStatus:
         return cls(**found, last=LastGoal(**last) if "id" in last and "state" in last else None)
 
     def events(self) -> list[StateChanged]:
-        """Convert the status to events of the last and the active goal."""
+        """Return the events of the last goal and the active goal in this status."""
         last, found = self.last, []
         if last:
             ended = Goal(last.id, last.state, last.text, last.reason, ended_at=last.at)
@@ -155,7 +155,7 @@ class RobotInfo:
 
 
 def _decode_object(payload: bytes) -> JsonObject | None:
-    """Decode a JSON object, or return None if the payload contains anything else."""
+    """Decode a JSON object. Return None if the payload contains anything else."""
     try:
         return decode(payload.strip())
     except BadRequest:
@@ -211,7 +211,10 @@ def homeassistant_device(name: str, allow: Collection[str], version: str) -> Mes
 
 
 def _command(robot: str, topic_level: str, platform: str, label: str | None, *, allowed: bool) -> JsonObject:
-    """Return a Home Assistant component that sends a request. It is empty if the request isn't allowed."""
+    """Return a Home Assistant component that sends a request.
+
+    If the request isn't allowed, the component is empty.
+    """
     if not allowed:
         return {"platform": platform}
     topic = topics.robot(robot, topic_level, topics.HOMEASSISTANT)

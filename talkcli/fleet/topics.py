@@ -36,7 +36,7 @@ HOMEASSISTANT_STATUS = f"{HOMEASSISTANT}/status"
 
 
 def name_fault(name: str) -> str | None:
-    """Return the reason why a robot, group or user name is invalid, or None if it is valid."""
+    """Return why the name of a robot, group or user is invalid. Return None if it is valid."""
     if _NAME_PATTERN.fullmatch(name):
         return None
     return f"must have 1 to {MAX_NAME_CHARS} characters (A-Z a-z 0-9 . _ -), and begin with a letter or a digit"
@@ -53,7 +53,7 @@ def group(name: str, *levels: str) -> str:
 
 
 def reply(user: str, session: str, *robot_name: str) -> str:
-    """Return the topic on which a robot replies to one session of a user.
+    """Return the topic for a robot's replies to one session of a user.
 
     Without a robot's name, return the response topic for a request to a group.
     """
@@ -73,7 +73,7 @@ def homeassistant_device(name: str) -> str:
 
 
 def parse_request(topic: str) -> tuple[str, str] | None:
-    """Return the kind and the user name in a request topic, or None for any other topic.
+    """Return the kind and the user name in a request topic. For other topics, return None.
 
     Returns:
         REQUEST, PLAIN_SAY or PLAIN_CANCEL, and the client's user name. The broker's access rules verify the name.
@@ -87,7 +87,7 @@ def parse_request(topic: str) -> tuple[str, str] | None:
 
 
 def checked_reply_topic(response_topic: str, user: str, robot_name: str) -> str | None:
-    """Return the topic for a robot's reply, or None if the client may not use it.
+    """Return the topic for a robot's reply. Return None if the client may not use it.
 
     This prevents users from making a robot publish to other users or to another robot's topic.
     """

@@ -108,7 +108,7 @@ class LocalConnection(ClientCore):
             self._socket.close()
 
     def abort(self) -> None:
-        """Shut down the connection, so that a waiting `read` returns.
+        """Shut down the connection. A waiting `read` then returns.
 
         The reader must then call `close`.
         """

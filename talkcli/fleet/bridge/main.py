@@ -184,12 +184,12 @@ class Bridge:
             raise self._error
 
     def end(self, error: BaseException | None = None) -> None:
-        """Make `run` take the robot offline and end. If an error is given, `run` raises it."""
+        """Take the robot offline, and end `run`. If an error is given, `run` raises it."""
         self._error = self._error or error
         self._ending.set()
 
     def _on_task_done(self, task: asyncio.Task[None]) -> None:
-        """End the bridge if a task has failed, so that the service manager restarts it."""
+        """End the bridge if a task has failed. The service manager will restart it."""
         if not task.cancelled() and (error := task.exception()):
             self.end(error)
 
@@ -299,9 +299,9 @@ class Bridge:
             self._handle_link_state(link)
 
     def _handle_link_state(self, link: Link) -> None:
-        """Close a stuck link, clean up after an ended one, and pause sessions while the broker is slow.
+        """Clean up after a broken connection. Pause all sessions while the broker is slow.
 
-        Call this after each use of the link.
+        Close the link first if the broker accepts no data. Call this after each use of the link.
         """
         if link is not self._link or self._descriptor < 0:
             return
@@ -345,7 +345,7 @@ class Bridge:
             self._publish(message)
 
     def _log_if_denied(self, code: int) -> None:
-        """Log an error if the broker's reason code says that this robot may not publish a message."""
+        """Log an error if the broker did not allow this robot to publish a message."""
         if code == REASON_NOT_AUTHORIZED:
             log.write_limited("rights", f"the broker does not allow this robot to publish a message; {_RIGHTS}")
 
@@ -391,7 +391,7 @@ class Bridge:
                 self._send_echo()
 
     def _handle_echo(self, payload: bytes) -> None:
-        """Record a returned echo, or respond to a bridge that asks whether the name is in use."""
+        """Process a returned echo, or the question of whether the robot's name is in use."""
         if payload.startswith(_RIVAL_QUESTION):
             if payload != _RIVAL_QUESTION + self._session.encode():
                 if self._online:
@@ -405,9 +405,10 @@ class Bridge:
             self._policy.record_echo(sent_at, boottime())
 
     def _handle_presence(self, payload: bytes) -> None:
-        """End this bridge if an older one has the same name. Tell a younger one that the name is taken.
+        """Process a presence message. End this bridge if an older bridge has the same name.
 
-        The message may come from this bridge, an earlier one, or another one with the same robot name.
+        Tell a younger bridge that the name is taken. The message may come from this bridge, an earlier one, or another
+        one with the same robot name.
         """
         presence = Presence.read(self._settings.name, payload)
         rank = bridge_rank(presence)
@@ -454,7 +455,7 @@ class Bridge:
         self._publish(Message(self._echo_topic, f"{self._session} {self._echo_at}".encode()))
 
     def _tick(self) -> None:
-        """Every few seconds, send an echo, check for timeouts, and renew the presence if it is due."""
+        """Every few seconds, send an echo, check for timeouts, and update the presence."""
         self._tick_timer = self._loop.call_later(ECHO_EVERY_S, self._tick)
         self._sessions.tick()
         self._publisher.tick()

@@ -64,7 +64,9 @@ class RemoteRequest:
     start_by: float | None = None
 
     def build_say(self, goal_id: str, now: float) -> Say:
-        """Return the `say` request for the server, with an id and a TTL that is limited by the message's expiry.
+        """Return the `say` request for the server, with a goal id and an adjusted TTL.
+
+        The message's expiry limits the TTL.
 
         Args:
             goal_id: the goal's id.
@@ -126,7 +128,7 @@ class Policy:
         self.newest_echo_at = 0.0
 
     def record_echo(self, sent_at_text: bytes, now: float) -> None:
-        """Record the sending time of an echo that has returned.
+        """Record when a returned echo was sent.
 
         Ignore it if its time is invalid or later than `now`.
         """
@@ -136,7 +138,7 @@ class Policy:
                 self.newest_echo_at = sent_at
 
     def decide(self, message: Message, kind: str, user: str, now: float) -> RemoteRequest | Refusal | Goodbye | Ignored:
-        """Decide whether to accept, refuse or ignore a message, or to end the client's session.
+        """Check a message from the broker. Return how to handle it.
 
         Args:
             message: a message on a request topic of the robot or one of its groups.
@@ -181,7 +183,7 @@ class Policy:
 
 
 def _parse_request_fields(kind: str, payload: bytes) -> JsonObject:
-    """Parse a payload, and return the fields of the request.
+    """Parse a payload. Return the fields of the request.
 
     Raises:
         BadRequest: the payload is malformed.
@@ -201,7 +203,7 @@ def _parse_request_fields(kind: str, payload: bytes) -> JsonObject:
 
 
 class SentIds:
-    """The ids of recent goals, their senders, and the server that each goal was sent to.
+    """A record of recent goals: their ids, senders and servers.
 
     A server is identified by its boot id.
     """
@@ -212,15 +214,15 @@ class SentIds:
         self._sent: dict[str, tuple[str, str, bool]] = {}
 
     def boot_of(self, goal_id: str) -> str | None:
-        """Return the boot id of the server that received a goal, or None if the goal is unknown."""
+        """Return the boot id of a goal's server. If the goal is unknown, return None."""
         return self._sent[goal_id][0] if goal_id in self._sent else None
 
     def user_of(self, goal_id: str) -> str | None:
-        """Return the name of the user who sent a goal, or None if the goal is unknown."""
+        """Return the name of a goal's sender. If the goal is unknown, return None."""
         return self._sent[goal_id][1] if goal_id in self._sent else None
 
     def is_counted(self, goal_id: str, boot: str) -> bool:
-        """Return whether a goal was sent to the server with this boot id and counts towards the limit."""
+        """Return whether a goal of the server with this boot id counts towards the limit."""
         return self.boot_of(goal_id) == boot and self._sent[goal_id][2]
 
     def add(self, goal_id: str, boot: str, user: str, *, counted: bool = True) -> None:
@@ -239,7 +241,7 @@ class SentIds:
 
 
 class RemoteGoals:
-    """Keeps track of remote clients' goals that are pending at the server or on their way there.
+    """Keeps track of remote clients' pending goals, including goals that are being sent.
 
     Goals with `preempt` or `flush` aren't counted. A goal's reply and its events arrive on different connections, in
     any order.
@@ -298,7 +300,7 @@ class RemoteGoals:
         return self._goals.pop(goal_id, None) is not None
 
     def replace_pending(self, pending: Iterable[tuple[str, str | None]]) -> None:
-        """Replace the recorded pending goals with the given pairs of goal id and key.
+        """Replace all recorded pending goals. Each given pair is a goal's id and key.
 
         Goals that are still on their way to the server are kept.
         """
@@ -307,7 +309,7 @@ class RemoteGoals:
 
 
 def without_texts(message: JsonObject, hidden: tuple[str, ...] = ("text", "spoken")) -> JsonObject:
-    """Return a copy of a message, with the given fields of its goals set to null."""
+    """Return a copy of a message. The given fields of its goals are null."""
     return {
         name: {**each, **dict.fromkeys(hidden)} if isinstance(each, dict) and "text" in each else each
         for name, each in message.items()
@@ -323,6 +325,6 @@ def sender_name(user: str, name: str | None = None) -> str:
 
 
 def remote_user(goal: Goal) -> str | None:
-    """Return the name of the remote user who sent a goal, or None for a local client."""
+    """Return the user name of a goal's remote sender. For a local sender, return None."""
     name = (goal.client and goal.client.name) or ""
     return name.removeprefix(topics.REMOTE_PREFIX).split(" ")[0] if name.startswith(topics.REMOTE_PREFIX) else None

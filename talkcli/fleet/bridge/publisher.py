@@ -195,7 +195,7 @@ class Publisher:
         self.schedule_status()
 
     def _update_goals(self, event: StateChanged) -> None:
-        """Update the active goal, the last goal and the texts from an event, without publishing them."""
+        """Update the active goal, the last goal and the texts from an event."""
         if event.state is State.PENDING:
             self._texts[event.id] = _shown_text(event.goal)
         elif event.state is State.ACTIVE:

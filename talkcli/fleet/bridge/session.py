@@ -109,12 +109,12 @@ class RemoteSessions:
             session.refuse(request, Busy.code, f"{self.name} already has {MAX_SESSIONS} remote clients")
 
     def handle_goodbye(self, user: str, reply_topic: str) -> None:
-        """After a client's goodbye, end its session once important requests are answered."""
+        """Handle a client's goodbye. Its session ends once important requests are answered."""
         if session := self._sessions.get((user, reply_topic)):
             session.handle_goodbye()
 
     def end_all(self) -> None:
-        """End all sessions without informing the clients, because the broker is disconnected."""
+        """End all sessions. Don't inform the clients, as the broker is disconnected."""
         for session in list(self._sessions.values()):
             session.end()
         self.may_read.set()
@@ -174,7 +174,7 @@ class RemoteSessions:
             self._release_handle = self._loop.call_soon(self._send_or_cancel_waiting)
 
     def _send_or_cancel_waiting(self) -> None:
-        """Send waiting goals while there is room, or cancel them if a client cancelled all goals."""
+        """Send waiting goals while there is room. If a client cancelled all goals, cancel them."""
         self._release_handle = None
         canceled_by, self._canceled_by = self._canceled_by, None
         if canceled_by and not self.goals.pending_count:
@@ -198,16 +198,16 @@ class RemoteSessions:
         self.handle_pending_change()
 
     def remember(self, goal: Goal, boot: str) -> None:
-        """Remember the id of a remote client's goal, in case an earlier bridge process sent it.
+        """Remember the id of a goal if a remote client sent it.
 
-        Ignore other goals. The goal counts towards the limit even if it was sent with `preempt`, because the server
-        doesn't report that.
+        Ignore other goals. An earlier bridge process may have sent the goal. It counts towards the limit even if it was
+        sent with `preempt`, because the server doesn't report that.
         """
         if (user := policy.remote_user(goal)) and self.ids.boot_of(goal.id) != boot:
             self.ids.add(goal.id, boot, user)
 
     def reset_pending(self, pending: tuple[Goal, ...], boot: str) -> None:
-        """Replace the recorded pending goals with the server's. Then send waiting goals."""
+        """Replace the recorded pending goals with those of the server. Then send waiting goals."""
         self.goals.replace_pending((each.id, each.key) for each in pending if self.ids.is_counted(each.id, boot))
         self.handle_pending_change()
 
@@ -225,7 +225,7 @@ class _RemoteExchange(Exchange):
 
     @property
     def goal_id(self) -> str | None:
-        """The goal's id if the request is a `say`, otherwise None."""
+        """The goal's id if the request is a `say`."""
         return self.request.id if isinstance(self.request, Say) else None
 
 
@@ -268,7 +268,7 @@ class RemoteSession:
         return not (self.unanswered or self._awaited or self._watching)
 
     def submit(self, request: RemoteRequest) -> None:
-        """Send a request, or queue it until the server is connected. Refuse it if there are too many."""
+        """Send a request, or queue it until the server is connected. Refuse excess requests."""
         self.used_at = self._loop.time()
         if self._said_goodbye:  # the client has returned
             self._said_goodbye, self._reply_topic = False, request.reply_topic
@@ -286,7 +286,7 @@ class RemoteSession:
                 self._task = asyncio.create_task(self._run(urgent=urgent))
 
     def handle_goodbye(self) -> None:
-        """Drop the client's waiting goals, and end the session once important requests are answered.
+        """Handle the client's goodbye. The session ends once important requests are answered.
 
         The client gets no more answers, and its waiting goals are dropped. The session stays open until the server has
         answered requests with a lasting effect.
@@ -333,11 +333,11 @@ class RemoteSession:
         return [request for request, _, session in self._sessions.waiting if session is self]
 
     def _drop_waiting(self) -> None:
-        """Remove the client's goals from the list of goals that are waiting for room."""
+        """Drop the client's goals that are waiting for room."""
         self._sessions.waiting = [each for each in self._sessions.waiting if each[2] is not self]
 
     def _end_if_done(self) -> None:
-        """End the session if the client has said goodbye and important requests are answered.
+        """End the session if its client has left and no important requests are unanswered.
 
         If `end` was called before the server was connected, close the connection.
         """
@@ -472,7 +472,7 @@ class RemoteSession:
         self._end_if_done()
 
     def _process_answer(self, message: JsonObject) -> list[tuple[bytes, bytes | None]]:
-        """Process one line of an answer. Return lines for the client, each with its correlation data."""
+        """Process one line of an answer. Return the lines for the client and their correlation data."""
         assert self._server
         exchange = self._server.match(message)
         if not isinstance(exchange, _RemoteExchange):
@@ -498,7 +498,10 @@ class RemoteSession:
         return [(encode(item(remote.seq, **each)), remote.correlation) for each in (*found, message)]
 
     def _record_say_reply(self, exchange: _RemoteExchange, state: State | None, *, refused: bool) -> None:
-        """Record whether the goal of a `say` request is pending, and forget a refused goal's id."""
+        """Process the reply to a `say` request. Record whether its goal is pending.
+
+        Forget the id of a refused goal.
+        """
         if exchange.goal_id is not None:
             self._sessions.goals.record_reply(exchange.goal_id, pending=state is State.PENDING)
             if exchange.is_new and refused:
@@ -541,7 +544,7 @@ class RemoteSession:
         self._publish([(encode({"event": "gone", "message": why}), None)])
 
     def _publish(self, lines: list[tuple[bytes, bytes | None]]) -> None:
-        """Publish lines for the client. Each line comes with its correlation data.
+        """Publish lines for the client, with their correlation data.
 
         Consecutive lines with the same correlation data are published in one message if they fit.
         """
@@ -560,7 +563,7 @@ class RemoteSession:
             self._sessions.publish(Message(self._reply_topic, payload, correlation=current), int(reliable))
 
     def _shorten_line(self, line: bytes, limit: int) -> bytes:
-        """Shorten a line that is too long for the broker. Return a line without texts, an error or nothing.
+        """Shorten a line that is too long for the broker. Return the new line.
 
         Return the line without texts if that is short enough. Otherwise, return an error in place of a reply, and an
         empty line in place of an event.
@@ -591,7 +594,7 @@ class RemoteSession:
 
 
 def _has_lasting_effect(remote: RemoteRequest) -> bool:
-    """Return whether to carry out a request even if the client has said goodbye.
+    """Return whether a request must be carried out after its client has left.
 
     A `patient` goal is dropped in that case.
     """

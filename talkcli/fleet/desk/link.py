@@ -104,14 +104,14 @@ class DeskLink:
 
     @property
     def retained_received(self) -> bool:
-        """Whether all retained messages count as received.
+        """Whether all retained messages have probably arrived.
 
         They do shortly after the marker message has arrived.
         """
         return self.marker_at is not None and time.monotonic() > self.marker_at + RETAINED_GRACE_S
 
     def reply_topic(self, robot: str) -> str:
-        """Return the topic on which a robot replies to this connection."""
+        """Return the topic for a robot's replies to this connection."""
         return topics.reply(self.user, self.session, robot)
 
     def poll(self, timeout: float, interrupt: Mapping[int, int] | None = None) -> bool:
@@ -148,7 +148,7 @@ class DeskLink:
         return descriptor in ready
 
     def _receive(self, message: Message) -> None:
-        """Pass a message to the handler, or record that the marker message has arrived."""
+        """Pass a message to the handler. For the marker message, only record its arrival."""
         if message.topic == self.reply_topic(topics.MARKER):
             self.marker_at = time.monotonic()
         else:
@@ -210,7 +210,7 @@ class DeskLink:
         return self.link.publish(message, on_acknowledged=on_acknowledged)
 
     def end_session(self, to: str, *, is_group: bool = False) -> None:
-        """Tell the bridge of a robot, or all bridges of a group, that no more requests will follow."""
+        """Tell the bridges of a robot or a group that no more requests will follow."""
         if self.link is not None:
             topic, response = self._topics(to, is_group=is_group)
             self.link.publish(Message(topic, b"", response=response), 0)
@@ -234,7 +234,7 @@ class DeskLink:
             self.poll(left)
 
     def close(self, *, forked: bool = False) -> None:
-        """Close the connection for good. In a forked child, close only its copies of the descriptors.
+        """Close the connection for good. In a forked child, only close the child's descriptors.
 
         Args:
             forked: whether this is a forked child process.
@@ -260,7 +260,7 @@ class DeskLink:
         return AccessDenied(f"{words}; add the lines of an operator to its access rules: talk bridge --print-acl")
 
     def _no_answer_error(self, timeout: float) -> TalkError:
-        """Return AccessDenied or ServerUnavailable to explain why retained messages didn't arrive in time.
+        """Return the error to raise if retained messages don't arrive in time.
 
         It is AccessDenied if the broker is connected but hasn't sent back the marker message.
         """
@@ -269,7 +269,7 @@ class DeskLink:
         return self._rejection_error(REASON_NOT_AUTHORIZED, f"read {topics.reply(self.user, '+', '+')}")
 
     def _maintain(self, link: Link | None, now: float) -> float:
-        """Connect, or keep the connection alive. Return the seconds until the next call is due."""
+        """Connect, or keep the connection alive. Return how many seconds to wait before the next call."""
         if link is not None:
             link.tick()
             if self.marker_at is None or self.retained_received:
@@ -290,7 +290,7 @@ class DeskLink:
         return TICK_EVERY_S if self._opening else max(0.0, self._next_attempt_at - now)
 
     def _end_attempt(self, opening: LinkOpener) -> None:
-        """Use the newly opened connection, or schedule another attempt if it could not be opened."""
+        """Start using a new connection. If the attempt failed, schedule another."""
         self._opening = None
         if opening.error is not None:
             self._failed_attempts += 1

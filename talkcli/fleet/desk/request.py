@@ -46,7 +46,7 @@ class Selection:
 
     @property
     def fault(self) -> str | None:
-        """An error message if no robot can ever match, otherwise None."""
+        """An error message if no robot can ever match."""
         for kind, name in (("group", self.group), ("robot", self.name)):
             if name is not None:
                 fault = topics.name_fault(name)

@@ -112,7 +112,7 @@ class RobotConnection(Connection):
         self.path = f"{robot} ({desk.broker.url})"
         self._interrupt, self._end = interrupt, end
         self._published_at = time.monotonic()
-        #: the robot's presence on the current connection to the broker, or empty if it hasn't arrived yet
+        #: the robot's presence; empty until it arrives on the current connection to the broker
         self._presence: JsonObject = {}
         #: the session id of the bridge that received the open requests, or None if there is no such bridge
         self._bridge_session: object = None
@@ -128,7 +128,7 @@ class RobotConnection(Connection):
     # -- requests
 
     def _send(self, exchange: Exchange) -> None:
-        """Send a request now, or when the robot is back. A goal gets an id and an expiry time."""
+        """Send a request now, or once the robot is back. A goal is given an id and an expiry time."""
         request = exchange.request
         if isinstance(request, Say) and isinstance(exchange, RobotExchange):
             exchange.request = replace(request, id=request.id or new_goal_id(self._desk))
@@ -176,7 +176,7 @@ class RobotConnection(Connection):
         return True
 
     def answer_deadline(self, exchange: Exchange) -> float:
-        """Return when the next line of an answer is due, or when an absent robot must be back."""
+        """Return the time limit for the next line of an answer, or for an absent robot's return."""
         if not isinstance(exchange, RobotExchange):
             return float("inf")  # This is a lookup, which is repeated after each absence.
         if self.absent_since is None:
@@ -186,11 +186,11 @@ class RobotConnection(Connection):
         return by if self._end is None else min(by, max(self._end, exchange.heard_at))
 
     def goals_lost_at(self) -> float:
-        """Return infinity, because `silent_by` ends the connection before goals count as lost."""
+        """Return infinity. Goals are only lost when the whole connection ends."""
         return float("inf")
 
     def silent_by(self, began: float) -> tuple[float, str]:
-        """Return the time at which to give up on a silent or absent robot, and the reason to report."""
+        """Return the time limit for a silent or absent robot, and the error message to use after it."""
         if self.absent_since is None:
             return super().silent_by(began)
         return self.absent_since + ABSENCE_LIMIT_S, f"{self.absence} (for {ABSENCE_LIMIT_S:g} s)"
@@ -218,7 +218,7 @@ class RobotConnection(Connection):
         self._desk.poll(timeout, self._interrupt if interruptible else None)
 
     def keep_alive(self) -> None:
-        """Keep the bridge's session alive by a message if nothing else was sent lately."""
+        """Send a message to keep the bridge's session alive, unless another was sent recently."""
         if time.monotonic() - self._published_at > _KEEP_ALIVE_INTERVAL_S:
             self._send_without_answer(Hello(self._sender))
 
@@ -243,7 +243,7 @@ class RobotConnection(Connection):
                 self.receive(message.payload, time.monotonic())
 
     def _mark_absent(self, why: str, error: type[ServerUnavailable] = ServerUnavailable) -> None:
-        """Record that the robot can't receive requests, and which error to raise in the meantime."""
+        """Mark the robot as absent. Store the reason and the error class to use."""
         self.absence, self._absence_error = why, error
         if self.absent_since is None:
             self.absent_since = time.monotonic()
@@ -272,7 +272,7 @@ class RobotConnection(Connection):
     # -- connecting
 
     def wait_online(self, give_up: float) -> None:
-        """Wait until the robot can receive requests. Raise an error if it still can't at the time `give_up`.
+        """Wait until the robot can receive requests, at most until `give_up`.
 
         `give_up` is a monotonic time. The errors are the same as those of `connect_robot`.
         """
@@ -295,7 +295,7 @@ class RobotConnection(Connection):
     # -- after an absence
 
     def _resume_requests(self) -> None:
-        """After an absence, resend or fail each open request, or look up its goal."""
+        """Resume open requests after an absence. Resend them, look up their goals, or report failure."""
         now = time.monotonic()
         if self._sender:
             self._send_without_answer(Hello(self._sender))
@@ -322,7 +322,7 @@ class RobotConnection(Connection):
             self._watch_again(now)
 
     def _resend(self, exchange: RobotExchange) -> None:
-        """Send a request again, or fail it if it has expired or was sent too often."""
+        """Send a request again. Report failure if it has expired or was sent too often."""
         if exchange.number not in self.exchanges:
             return  # The caller has stopped waiting for the answer.
         request = exchange.request
@@ -383,7 +383,7 @@ class RobotConnection(Connection):
             self._publish(exchange)
 
     def dispatch(self, message: JsonObject, now: float) -> Exchange | None:
-        """Process a message from the server or the bridge. Return the exchange that it ends, if any."""
+        """Process a message from the server or the bridge. Return the completed exchange, if any."""
         if message.get("event") == "gone":
             self.end(printable(str(message.get("message") or "the connection to the server was lost")))
             return None
@@ -405,12 +405,12 @@ class RobotConnection(Connection):
         self._desk.wake()
 
     def _drop(self) -> None:
-        """Close the connection to the broker. In a forked child, close only its copies of the descriptors."""
+        """Close the connection to the broker. In a forked child, only close the child's descriptors."""
         self._desk.close(forked=os.getpid() != self._process)
 
 
 def connect_robot(robot: str, broker: Broker, *, keep_trying_s: float = 0.0, **options: Any) -> RobotConnection:
-    """Connect to a robot's server through the broker, and return the connection.
+    """Connect to a robot's server through the broker. Return the connection.
 
     Args:
         robot: the name of the robot.

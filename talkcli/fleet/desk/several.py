@@ -128,7 +128,7 @@ class FleetRequest:
         return self.results()
 
     def __len__(self) -> int:
-        """Return how many selected robots have been found so far, including those that are offline."""
+        """Return the number of selected robots found so far, including offline robots."""
         return len(self._included)
 
     @property
@@ -138,7 +138,7 @@ class FleetRequest:
 
     @property
     def why_disconnected(self) -> str | None:
-        """An error message if the broker is disconnected, otherwise None."""
+        """An error message if the broker is disconnected."""
         return None if self._desk.link else f"the connection to the broker at {self._desk.broker.url} was lost"
 
     def results(self, timeout: float | None = None) -> Iterator[Outcome]:
@@ -259,7 +259,7 @@ class FleetRequest:
         link.subscribe(topics.robot(topics.ANY, topics.PRESENCE), retained=True)
 
     def on_disconnected(self, why: str) -> None:
-        """Treat all robots as absent until they are back. Ignore robots that weren't known before."""
+        """Treat all robots as absent until they are back. Don't accept new robots."""
         # Ignore robots that appear after this, because the broker may be back too late.
         self._complete = self._complete or self._began
         for each in self._robots.values():
@@ -282,7 +282,7 @@ class FleetRequest:
                 self._on_presence(robot, presence)
 
     def _on_presence(self, robot: RobotRequest, presence: Presence) -> None:
-        """Include a robot when its presence first arrives, and later update its outcomes.
+        """Process a robot's presence. If the robot is new, add it to the request.
 
         Send the request if possible. After all retained messages have arrived, new robots are ignored, because they
         came online too late. Until then, every member of a group is expected to answer. Some members may have come
@@ -339,7 +339,7 @@ class FleetRequest:
             self._robots[name].update(fail_if_late=fail_if_late)
 
     def _record(self, *outcomes: Outcome) -> None:
-        """Store outcomes for `results` to yield, and mark robots as finished after their last outcome."""
+        """Store outcomes for `results`. A robot is finished after its last outcome."""
         self._outcomes += outcomes
         self._unfinished -= {each.robot for each in outcomes if each.last}
 
@@ -360,7 +360,7 @@ class RobotRequest:
         self._since = time.monotonic()
 
     def send(self) -> None:
-        """Send the request to this robot only, or record a failure if the robot is absent."""
+        """Send the request to this robot. Record a failure if the robot is absent."""
         try:
             self.connection.check_online()
             self.connection.begin(self._request, self._on_reply, self._on_failure)
@@ -369,7 +369,7 @@ class RobotRequest:
             self._on_failure(error)
 
     def expect_reply(self, number: int, expires_at: float | None) -> None:
-        """Prepare to receive the answer to the request, which was sent to the robot's group.
+        """Prepare for the answer to a request that was sent to the robot's group.
 
         Args:
             number: the number of the request.
@@ -401,7 +401,7 @@ class RobotRequest:
             self._record(Outcome(self._name, handle.state.name, code, handle.goal, last=not self._handles))
 
     def _on_reply(self, reply: JsonObject, items: list[JsonObject]) -> None:
-        """Start waiting for the request's goals, or record the outcomes if there are none."""
+        """Process the robot's reply. Wait for its goals, or record the outcomes if it has no goals."""
         request = self._request
         found: list[Goal] = []
         if isinstance(request, Say):
@@ -417,7 +417,7 @@ class RobotRequest:
             self._record(*reply_outcomes(self._name, request, reply, items))
 
     def _on_failure(self, error: TalkError) -> None:
-        """Record the failure of the request, after the outcomes of goals that it has cancelled."""
+        """Record that the request failed. First record the goals that it cancelled."""
         try:
             items = error.items if isinstance(error, UnknownGoal) else []
             self._record(*outcomes_of_cancel(self._name, items, last=False))

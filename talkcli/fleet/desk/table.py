@@ -75,7 +75,7 @@ def _row_cells(robot: RobotInfo, screen: Screen, now: float) -> dict[str, Cell]:
 
 
 def _server_version(presence: Presence) -> str | None:
-    """Return the version of the robot's server, or None if the robot has no server."""
+    """Return the version of the robot's server. Return None if there is no server."""
     server = presence.server
     return None if server is None else printable(str(server.get("version") or "?"), _MAX_VERSION_CHARS)
 
@@ -86,7 +86,7 @@ def _boot_id(presence: Presence) -> str:
 
 
 def _speaking_cell(status: RobotStatus, screen: Screen) -> Cell:
-    """Return the cell that shows the active goal, or whether speech is paused."""
+    """Return the cell for the active goal. It also shows whether speech is paused."""
     if status.active is None:
         return ("PAUSED", State.PREEMPTING) if status.paused else _EMPTY_CELL
     words = screen.goal_id(status.active) if status.text is None else f'"{printable(status.text)}"'
@@ -112,7 +112,7 @@ def _format_age(seconds: float) -> str:
 
 
 def _fit_columns(widths: dict[str, int], room: int | None) -> None:
-    """Shrink or remove columns in `widths` until a line fits into `room` characters."""
+    """Shrink or remove columns in `widths` to fit a line into `room` characters."""
     longest = widths["SPEAKING"]
     if room is None:
         widths["SPEAKING"] = min(longest, _USUAL_TEXT_CHARS)
@@ -147,7 +147,10 @@ class FleetTranscript:
     """
 
     def __init__(self, *, full: bool) -> None:
-        """Create an empty transcript. For `full`, see `Transcript`."""
+        """Create an empty transcript.
+
+        `full` has the same meaning as for `Transcript`.
+        """
         self._full = full
         self._columns = ColumnWidths()
         self._transcripts: dict[str, Transcript] = {}
@@ -155,7 +158,7 @@ class FleetTranscript:
         self._boots: dict[str, str] = {}
 
     def begin(self, robots: Sequence[Presence], broker: str, screen: Screen, now: float) -> list[str]:
-        """Return the first line, which shows the number of robots. Reserve space for their names."""
+        """Return the heading with the number of robots. Prepare the column of names."""
         for each in robots:
             self._columns.pad_robot(each.name, screen)  # All names must be known first, so that all lines are aligned.
             self._boots[each.name] = _boot_id(each)
@@ -167,7 +170,10 @@ class FleetTranscript:
         return [cut(f"{clock_time(now)}{COLUMN_GAP}{', '.join(parts)}; {printable(broker)}", screen.columns_left(0))]
 
     def lines(self, name: str, event: Event, screen: Screen, now: float) -> list[str]:
-        """Format an event of a robot as lines. For details, see `Transcript.lines`."""
+        """Format an event of a robot as lines.
+
+        The arguments are those of `Transcript.lines`.
+        """
         if name not in self._transcripts:
             self._transcripts[name] = Transcript(
                 full=self._full, words=False, robot=name, boot=self._boots.get(name, ""), widths=self._columns
@@ -175,7 +181,7 @@ class FleetTranscript:
         return self._transcripts[name].lines(event, screen, now)
 
     def change_lines(self, before: Presence | None, robot: Presence, screen: Screen, now: float) -> list[str]:
-        """Return a line about a change of a robot or its server, and forget the robot's goals.
+        """Format a change of a robot or its server as a line. Forget the robot's goals.
 
         Args:
             before: the presence before the change, or None if the robot was unknown.

@@ -88,7 +88,7 @@ class BrokerAway:
 
 @frozen
 class BrokerBack:
-    """Reports that the broker is connected again, after an absence of `after` seconds."""
+    """Reports that the broker is connected again. It was away for `after` seconds."""
 
     after: float
 
@@ -136,7 +136,7 @@ class _RetainedReader:
         link.subscribe(*self._wanted, retained=True)
 
     def on_disconnected(self, why: str) -> None:
-        """Do nothing, because `wait_for_retained` raises the error."""
+        """Do nothing. `wait_for_retained` raises the error."""
 
     def on_message(self, message: Message) -> None:
         """Store a message in `messages`."""
@@ -173,11 +173,11 @@ class FleetWatch:
         self._desk.handler = self
         self._events: deque[FleetEvent] = deque()
         self._presences: dict[str, Presence] = {}
-        #: for each robot, the ids of the goals last reported as ended (key True) and as started (key False)
+        #: by robot name: the ids of the last goals that were reported as ended (key True) and as started (key False)
         self._reported: dict[str, dict[bool, str]] = {}
         #: the robots whose events may have been missed. Their next status message shows the goals that were missed.
         self._maybe_missed: set[str] = set()
-        #: the messages on a new connection until all retained ones have arrived, otherwise None
+        #: the messages that have arrived on a new connection; None once all retained messages are there
         self._retained: list[Message] | None = None
         #: when the connection to the broker was lost (monotonic time) and why, or None if the broker is connected
         self._away_since: float | None = time.monotonic()
@@ -218,7 +218,7 @@ class FleetWatch:
         link.subscribe(*(topics.robot(robot, each) for each in (topics.PRESENCE, topics.STATUS)), retained=True)
 
     def on_disconnected(self, why: str) -> None:
-        """Report that the broker is away, but only once per absence."""
+        """Report once that the connection to the broker was lost."""
         self._retained, self._away_why = None, why
         if self._away_since is None:
             self._away_since = time.monotonic()
@@ -251,7 +251,7 @@ class FleetWatch:
     # -- time limits
 
     def _handle_due(self, now: float) -> None:
-        """Process retained messages, and report missing robots. Raise Lost if the broker stays away."""
+        """Process retained messages, and report missing robots. Raise Lost if the broker can't be reached."""
         if self._retained is not None and self._desk.retained_received:
             self._process_retained(self._retained, now)
         if self._away_since is not None and now - self._away_since >= ABSENCE_LIMIT_S:
@@ -295,7 +295,7 @@ class FleetWatch:
             self._events.append(RobotChanged(name, before, presence))
 
     def _report_missed(self, name: str, status: RobotStatus | None, arrived: Container[str | None] = ()) -> None:
-        """Report an EventsMissed if a robot's status shows goals that haven't been reported.
+        """Report missed events if a robot's status shows goals that haven't been reported.
 
         Args:
             name: the name of the robot.
@@ -314,7 +314,7 @@ class FleetWatch:
             self._events.append(EventsMissed(RobotInfo(presence, status), tuple(missed)))
 
     def _report(self, robot_event: RobotEvent) -> None:
-        """Report an event of a selected robot, and remember its goal to detect missed events."""
+        """Report a robot's event. Remember its goal to detect missed events later."""
         name, event = robot_event.name, robot_event.event
         if self._selection and name not in self._presences:
             return
@@ -337,7 +337,7 @@ def _read_event(message: Message) -> RobotEvent | None:
 
 
 def _identity(presence: Presence | None) -> tuple[object, ...]:
-    """Return a value that changes when a robot, its bridge or its server starts or stops."""
+    """Return a value that identifies the current run of a robot, its bridge and its server."""
     if presence is None or not presence.online:
         return (False,)
     return True, presence.session, presence.server and presence.server.get("boot")
