@@ -50,7 +50,7 @@ class ServerUnavailable(TalkError):
 
 
 class AccessDenied(TalkError):
-    """The user may not use the server, or can't trust the process behind its socket."""
+    """The user has no access to the server, or the server's process isn't trusted."""
 
     code = "permission_denied"
     exit_code = 10

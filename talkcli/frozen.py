@@ -90,7 +90,7 @@ class _Methods:
         return hash((type(self), *fields(self).values()))
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Make `copy` and `pickle` create instances by calling the class, because fields can't be set."""
+        """Make `copy` and `pickle` call the class instead of setting fields."""
         return type(self), tuple(fields(self).values())
 
     def __repr__(self) -> str:
@@ -102,7 +102,7 @@ _METHODS = {name: each for name, each in vars(_Methods).items() if callable(each
 
 
 def _compile_init(cls: Any) -> Any:
-    """Compile a fast `__init__` for a class, and return it.
+    """Compile a fast `__init__` for a class. Return the function.
 
     It is five times as fast as the generic one.
     """

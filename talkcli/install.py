@@ -45,7 +45,10 @@ def command(*packages: str, reinstall: bool = False) -> str:
 
 
 def neural_command(*more: str, reinstall: bool = False) -> str:
-    """Return the command that installs the packages for neural voices. On a 32-bit system, return advice."""
+    """Return the shell command that installs the packages for neural voices.
+
+    On a 32-bit system, return an explanation instead, because neural voices need a 64-bit system.
+    """
     if not IS_64_BIT:
         return "neural voices need a 64-bit system; use an espeak voice, such as en"
     return command(*NEURAL_PACKAGES, *more, reinstall=reinstall)

@@ -34,7 +34,9 @@ def named_socket(option: str | None) -> str | None:
 
 
 def named_robot(option: str | None, socket: str | None) -> str | None:
-    """Return the robot named by --robot or, without --socket, by TALK_ROBOT.
+    """Return the robot's name from --robot or TALK_ROBOT, if one is set.
+
+    TALK_ROBOT is ignored if --socket is given.
 
     Both options take precedence over the variables, and TALK_ROBOT over
     TALK_SOCKET.
@@ -43,7 +45,10 @@ def named_robot(option: str | None, socket: str | None) -> str | None:
 
 
 def client_sockets(named: str | None) -> list[str]:
-    """Return the socket paths that a client tries, in order, or only `named` if it is given."""
+    """Return the socket paths that a client tries, in order.
+
+    If `named` is given, it is the only one.
+    """
     if named:
         return [named]
     directories = [os.environ.get("XDG_RUNTIME_DIR"), *_runtime_directories(os.getuid())]
@@ -71,7 +76,7 @@ def describe_place(path: str, error: OSError) -> str:
 
 
 def closed_directory(path: str) -> str | None:
-    """Return the first directory on the way to a path that this user can't enter, or None."""
+    """Return the first parent directory of a path that this user can't enter, if any."""
     from pathlib import Path  # rarely needed, and slow to import
 
     directories = reversed(Path(os.path.abspath(path)).parents)
@@ -92,13 +97,13 @@ def _runtime_directories(uid: int) -> list[str]:
 
 
 def sudo_caller(environment: Mapping[str, str]) -> int | None:
-    """Return the id of the user who ran sudo, or None outside sudo."""
+    """Return the id of the user who ran sudo, if any."""
     caller = environment.get("SUDO_UID", "")
     return int(caller) if os.getuid() == 0 and caller.isdecimal() else None
 
 
 def sudo_caller_socket() -> str | None:
-    """Return the path of an existing socket of the user who ran sudo, or None."""
+    """Return the path of the sudo user's socket, if it exists."""
     caller = sudo_caller(os.environ)
     if caller is None:
         return None
@@ -114,7 +119,7 @@ def sudo_caller_socket() -> str | None:
 
 
 def server_socket(named: str | None) -> str:
-    """Return the path for a server's socket, and create the directory of the default path.
+    """Return the path for a server's socket. Create the directory of the default path.
 
     Raises:
         AddressInUse: the directory is missing or not safe.
@@ -170,5 +175,5 @@ def cache_directory() -> str:
 
 
 def _user_directory(named: str | None, default: str) -> str:
-    """Return the named directory if its path is absolute, or else the default with ~ expanded."""
+    """Return `named` if it is an absolute path. Otherwise, return `default` with ~ expanded."""
     return named if named and os.path.isabs(named) else os.path.expanduser(default)

@@ -47,7 +47,7 @@ def _decode_integer(data: bytes) -> int:
 
 
 def command_name(pid: int) -> str | None:
-    """Return the name of the program that a process runs, or None if it is unknown."""
+    """Return the name of the program that a process runs, if it is known."""
     line = read_proc_file(f"/proc/{pid}/comm")
     return line.decode(errors="replace").rstrip("\n") if line else None
 
@@ -63,7 +63,9 @@ def ancestors(pid: int) -> Iterator[int]:
 
 
 def parent_command_line(pid: int) -> str | None:
-    """Return the start of the parent's command line, or None if it is unknown. Skip wrappers such as sudo.
+    """Return the start of the parent's command line, if it is known.
+
+    Wrappers such as sudo are skipped.
 
     Wrappers are programs that run another program. For `timeout 5 talk say …`, the result is the script that called
     `timeout`.
@@ -81,14 +83,17 @@ def parent_command_line(pid: int) -> str | None:
 
 
 def process_stat(pid: int) -> list[bytes]:
-    """Return the fields of /proc/PID/stat from the state on, or an empty list on failure."""
+    """Return the fields of /proc/PID/stat, starting with the process state.
+
+    Return an empty list if the file can't be read.
+    """
     stat = read_proc_file(f"/proc/{pid}/stat") or b""
     # The program's name comes before the state, in brackets. The name itself can contain spaces and brackets.
     return stat.rpartition(b")")[2].split()
 
 
 def read_proc_file(path: str, max_bytes: int = 4096) -> bytes | None:
-    """Return the start of a file in /proc, or None if it can't be read.
+    """Return the start of a file in /proc, if it can be read.
 
     Args:
         path: path to the file.

@@ -1,4 +1,4 @@
-"""Functions that find and kill running processes with the help of pipes."""
+"""Functions that use pipes to find and kill running processes."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def kill(pids: Iterable[int]) -> bool:
 
 
 def process_ids() -> list[int]:
-    """Return the ids of all processes, or an empty list if /proc can't be read."""
+    """Return the ids of all processes. The list is empty if /proc can't be read."""
     return [int(name) for name in _list_names("/proc") if name.isdigit()]
 
 
@@ -85,7 +85,7 @@ def _read_links(folder: str) -> Iterator[str]:
 
 
 def _list_names(folder: str) -> list[str]:
-    """Return the names of the entries in a directory, or an empty list if it can't be read."""
+    """Return the names in a directory. The list is empty if the directory can't be read."""
     try:
         return os.listdir(folder)
     except OSError:  # the directory belongs to another user, or doesn't exist
@@ -93,7 +93,10 @@ def _list_names(folder: str) -> list[str]:
 
 
 def signal_name(number: int) -> str:
-    """Return the name of a signal, such as SIGTERM, or "signal N" if it has none."""
+    """Return the name of a signal, such as SIGTERM.
+
+    If it has no name, return "signal" and the number.
+    """
     try:
         return signal.Signals(number).name
     except ValueError:

@@ -31,7 +31,7 @@ _REPEAT_AFTER_S = 60.0
 
 
 class RateLimit:
-    """A limit of `max_events` events per period."""
+    """A limit on the number of events in a period."""
 
     def __init__(self, max_events: int, period_s: float) -> None:
         self._max_events = max_events
@@ -41,7 +41,9 @@ class RateLimit:
         self._event_count = 0
 
     def count_event(self, now: float) -> int | None:
-        """Count an event. Return the number of events suppressed before it, or None to suppress this one.
+        """Count an event. Return how many were suppressed before it, or None at the limit.
+
+        If the result is None, the caller must suppress the event.
 
         Only the events that have been suppressed since the last allowed event are counted.
         """
@@ -60,7 +62,7 @@ _rate_limits: dict[str, RateLimit] = {}
 
 
 def write(message: str) -> None:
-    """Write a line to the log, or count it as lost if writing would block.
+    """Write a line to the log without blocking. Count lines that can't be written.
 
     The next line that is written gives the number of lost lines.
     """

@@ -101,7 +101,10 @@ class ServiceManager:
         self._timers[name] = self._loop.call_later(seconds, act)
 
     def _send(self, **fields: str) -> None:
-        """Send these fields and any unsent ones to the service manager. If this fails, retry later."""
+        """Send fields to the service manager. Retry later if this fails.
+
+        Fields from failed attempts are sent again.
+        """
         if self._socket is None:
             return
         self._status = fields.get("STATUS", self._status)

@@ -65,7 +65,7 @@ _PARTIAL_LINE = re.compile(
     r"[ \t>]*(?![ \t>])(?:[-*+•=_#|:`~ \t]{0,500}(?:(?<=[ \t])\[?[ xX]?\]?)?|\d{1,3}(?:[.)](?:[ \t]+\[?[ xX]?\]?)?)?"
     r"|(?:`{3,}|~{3,}(?!~))[^`\n]{0,500}|\[[^\]\n]{0,200}(?:\](?::[^\n]{0,500})?)?)\Z"
 )
-#: The end of a paragraph, after which no mark in it can be closed.
+#: The end of a paragraph. Marks that are still open there are never closed.
 _PARAGRAPH_END = re.compile(r"\n[ \t]*(?:\n|[-*+•#][ \t]|\||```|\d{1,3}[.)][ \t])")
 _LINK = re.compile(
     r"""!?\[(?P<label>(?:[^\[\]\\]|\\.|\[(?:[^\[\]\\]|\\.)*\])*)(?P<end>\](?:\[[^\[\]\n]*\]|\([ \t\n]{0,9}"""
@@ -135,7 +135,7 @@ class MarkdownReader:
         return "".join(found)
 
     def _read_token(self) -> str | None:
-        """Return the text before the next token, or the token without its marks.
+        """Return the text before the next token. At a token, return the token without its marks.
 
         Return None if more text is needed.
         """
@@ -187,7 +187,7 @@ class MarkdownReader:
         return newline + marks
 
     def _read_code_line(self) -> str | None:
-        """Return blanks for a line of a code block, and leave the block after its last line."""
+        """Return blanks for a line of a code block. End the block after its last line."""
         text, at = self._text, self._at
         end = text.find("\n", at)
         line = text[at : end if end >= 0 else len(text)]
@@ -201,7 +201,7 @@ class MarkdownReader:
         return " " * (len(line) + (end >= 0))
 
     def _read_span(self, kind: str, token: re.Match[str]) -> str | None:
-        """Return the replacement for the beginning of a span, and remember where the span ends.
+        """Return the replacement for the start of a span. Store where the span ends.
 
         If the span is code, return the whole span.
         """
@@ -227,7 +227,10 @@ class MarkdownReader:
         return " " * len(mark)
 
     def _read_mark(self, kind: str, token: re.Match[str]) -> str:
-        """Blank the marks of a token that begins neither a line nor a span. Return the result."""
+        """Replace the marks of any other token with blanks. Return the result.
+
+        Such a token begins neither a line nor a span.
+        """
         text, (start, end), mark = self._text, token.span(), token.group()
         before, after = text[start - 1 : start] or "\n", text[end : end + 1] or "\n"
         kept = 0  # number of characters at the end of the token that aren't marks
@@ -252,7 +255,7 @@ class MarkdownReader:
 
 
 def _is_letter(character: str) -> bool:
-    """Return whether a character is a letter or a digit of a script with blanks between words."""
+    """Return whether a character is a letter or digit in a script that separates words with blanks."""
     return character.isalnum() and character < _FIRST_UNSPACED
 
 

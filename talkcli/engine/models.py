@@ -76,7 +76,7 @@ class VoiceDescription:
 
 
 def missing_package() -> str | None:
-    """Return an error message if a package for neural voices is missing, or None."""
+    """Return an error message if a package for neural voices is missing."""
     from importlib.util import find_spec
 
     missing = next((each for each in install.NEURAL_PACKAGES if find_spec(each) is None), None)
@@ -208,7 +208,7 @@ def _walk_path(path: str) -> Iterator[tuple[str, bool]]:
 
 
 def _others_can_write(path: str, status: os.stat_result) -> bool:
-    """Return whether anyone except root and this user may write to a file."""
+    """Return whether users other than root and this user can write to a file."""
     if status.st_mode & stat.S_IWOTH:
         return True
     if not status.st_mode & stat.S_IWGRP:
@@ -217,7 +217,7 @@ def _others_can_write(path: str, status: os.stat_result) -> bool:
 
 
 def _require_safe_owner(path: str, status: os.stat_result) -> None:
-    """Raise VoiceFileError if a file belongs to anyone except root and this user."""
+    """Raise VoiceFileError unless a file belongs to root or this user."""
     if status.st_uid not in {0, os.geteuid()}:
         words = f"{path} belongs to another user (#{status.st_uid}), who could change the voice"
         raise VoiceFileError(f"{words}; put it into a directory of your own")
@@ -267,7 +267,7 @@ def _model_directories(environment: Mapping[str, str] | None) -> Iterator[str]:
 
 
 def _list_entries(directory: str, suffix: str) -> list[str]:
-    """Return the sorted paths of a directory's entries with this suffix, except hidden ones.
+    """Return the sorted paths of a directory's visible entries with this suffix.
 
     If the directory can't be read, return an empty list.
     """

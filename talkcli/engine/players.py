@@ -222,7 +222,7 @@ def sound_server_sockets(env: Mapping[str, str], *uids: int) -> list[str]:
 
 
 def has_no_output(env: Mapping[str, str], snd_dir: str = "/dev/snd", etc_dir: str = "/etc") -> bool:
-    """Return whether it is certain that this process can't play any sound.
+    """Return whether this process certainly can't play any sound.
 
     This only looks at file names, so that no sleeping device wakes up. Any custom configuration counts as an output,
     because it may lead to any device.
@@ -251,7 +251,7 @@ def _has_default_server(path: str) -> bool:
 
 
 def _list_directory(directory: str) -> list[str]:
-    """Return the sorted names in a directory, or an empty list if it can't be read."""
+    """Return the sorted names in a directory. The list is empty if it can't be read."""
     with contextlib.suppress(OSError):
         return sorted(os.listdir(directory))
     return []

@@ -111,12 +111,12 @@ class Speak:
     voice_only: bool = False  # whether to wait for the neural voice to load, and fail if it can't be loaded
     format: str = "text"  # "text" or "markdown"
     more: bool = False  # whether text will be added with `Append`
-    broken: bool = False  # whether the text broke off, so that an incomplete sentence at its end isn't spoken
+    broken: bool = False  # whether the text broke off; an incomplete sentence at its end is not spoken
 
 
 @frozen
 class Append:
-    """The command to add text to a goal that was sent with `Speak.more`.
+    """The command to add text to a goal that is still growing.
 
     It is ignored if the goal has ended.
     """
@@ -124,7 +124,7 @@ class Append:
     id: str
     text: str
     end: bool  # whether the text is now complete
-    broken: bool = False  # whether the text broke off, so that an incomplete sentence at its end isn't spoken
+    broken: bool = False  # whether the text broke off; an incomplete sentence at its end is not spoken
 
 
 @frozen
@@ -157,7 +157,7 @@ class Continue:
 
 @frozen
 class NextGoal:
-    """The command that describes the next goal in the queue.
+    """The command to update the information about the next goal in the queue.
 
     It replaces `next_waits` and `next_is_neural` of the current goal.
     """
@@ -266,7 +266,7 @@ class Started:
 
 @frozen
 class Alive:
-    """A heartbeat from a process that is busy but has sent nothing else for `ALIVE_INTERVAL_S`."""
+    """A heartbeat from a busy process that has sent nothing else for `ALIVE_INTERVAL_S`."""
 
     id: str  # ID of the current goal; empty if only a voice is loading
 
@@ -284,7 +284,7 @@ class Word:
 
 @frozen
 class TextMissing:
-    """The goal has become silent because text is missing, or it has continued.
+    """The goal is silent because text is missing, or it is heard again.
 
     While the goal is silent, the event is repeated after long additions that can't be spoken yet.
     """
@@ -359,7 +359,7 @@ def encode(message: Command | Event) -> bytes:
 
 
 def decode(line: bytes, classes: Mapping[str, type[_M]]) -> _M:
-    """Parse a line of JSON, and return the message.
+    """Parse a line of JSON. Return the message.
 
     Args:
         line: the line of JSON.

@@ -48,7 +48,9 @@ class UnknownVoice(Exception):
 
 
 def is_own_driver(driver: str | None) -> bool:
-    """Return whether a driver is one of `talk`'s own synthesizers, which exist only on Linux.
+    """Return whether a driver is one of `talk`'s own synthesizers.
+
+    Those exist only on Linux.
 
     A built-in synthesizer plays through a player, while any other driver plays its sound itself.
     """
@@ -64,7 +66,7 @@ def list_voices(engine: Any) -> tuple[Voice, ...]:
 
 
 def find_voice(wanted: str, voices: tuple[Voice, ...], server_voice: str | None = None) -> Voice | None:
-    """Find a voice by name. Return None if no voice matches, or several do.
+    """Find a voice by name. Return it if exactly one voice matches.
 
     The name is compared with the ids, the last parts of the ids, the names and the languages of the voices, in this
     order, ignoring case. It may end with a variant ("en-us+f3"). The returned voice's id includes the variant. If
@@ -95,7 +97,7 @@ def matching_languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
 
 
 def _matching_voices(wanted: str, voices: tuple[Voice, ...], server_voice: str | None = None) -> dict[str, Voice]:
-    """Return the voices that a name may refer to, each under an unambiguous name."""
+    """Return the voices that a name may refer to, by unambiguous name."""
     for words in _possible_names(wanted, voices):
         fitting: dict[Voice, str] = {}
         for word in words:
@@ -108,7 +110,7 @@ def _matching_voices(wanted: str, voices: tuple[Voice, ...], server_voice: str |
 
 
 def _possible_names(wanted: str, voices: tuple[Voice, ...]) -> Iterator[list[str]]:
-    """Yield lists of names that `wanted` may stand for, most likely first."""
+    """Yield lists of voice names that the user may have meant, most likely first."""
     yield [wanted]
     name, mark, speaker = wanted.partition(SPEAKER_MARK)
     word = _fold(name)
@@ -145,7 +147,10 @@ def _languages_named(word: str, voices: Sequence[Voice]) -> list[str]:
 
 
 def _english_names(voice: Voice) -> list[str]:
-    """Return the English words for a voice's language: "Chinese" and "Mandarin" for "Chinese (Mandarin)"."""
+    """Return the English words for a voice's language.
+
+    For "Chinese (Mandarin)", these are "Chinese" and "Mandarin".
+    """
     names = [each.strip() for each in re.split("[(),]", voice.name)]
     return [each for each in (*names, names[0].partition(" ")[0]) if each]
 
@@ -189,7 +194,10 @@ def _find_exact(wanted: str, voices: tuple[Voice, ...], server_voice: str | None
 
 
 def neural_language(voice: str) -> str:
-    """Return the language code from the id of a neural voice: "en-us" for "piper/en_US-joe"."""
+    """Return the language code from the id of a neural voice.
+
+    For "piper/en_US-joe", this is "en-us".
+    """
     return voice.removeprefix(NEURAL_PREFIX).partition("-")[0].replace("_", "-").lower()
 
 
@@ -302,7 +310,7 @@ def _names_of(voice: Voice) -> tuple[str, str, str, str]:
 
 
 def _find_variant(suffix: str, variants: list[Voice]) -> Voice | None:
-    """Find a variant by the part of a voice's name after the "+".
+    """Find a variant by the name after the "+" in a voice's name.
 
     Return None if there is none. As in libespeak-ng, the numbers 1 to 9 select male variants, and the numbers from 11
     on select female variants.

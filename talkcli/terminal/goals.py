@@ -223,7 +223,7 @@ def _shown_text(goal: Goal) -> str | None:
 
 
 def _silence_reasons(goal: Goal) -> list[str]:
-    """Return the reasons why an unfinished goal is silent at the moment, if any."""
+    """Return the reasons why an unfinished goal is silent now."""
     if goal.state.terminal:
         return []
     return ["paused"] * goal.paused + ["waiting for text"] * goal.waits
@@ -324,7 +324,7 @@ def reason_forms(goal: Goal, screen: Screen) -> list[str]:
 
 
 def _message_details(goal: Goal) -> str:
-    """Return the part of a goal's message that adds to its reason, or an empty text."""
+    """Return the details that a goal's message adds to its reason, if any."""
     if goal.state not in {State.ABORTED, State.REJECTED} and goal.by is not None:
         return ""
     details = message_details(goal.message)
@@ -343,7 +343,7 @@ def _muted_note(goal: Goal) -> list[str]:
 
 
 def _sender_command(sender: Sender) -> str:
-    """Return the command line of the sender's parent, or else the sender's program."""
+    """Return the command line of the sender's parent. If it is unknown, return its program."""
     return printable(sender.parent or sender.command or "a program", _SENDER_COMMAND_CHARS)
 
 
@@ -409,7 +409,7 @@ def clock_time(seconds: float | None) -> str:
 
 
 def _format_date_and_time(seconds: float | None) -> str | None:
-    """Format a timestamp as local date and time, or return None if it is None."""
+    """Format a timestamp as local date and time. Return None for None."""
     return None if seconds is None else time.strftime("%Y-%m-%d %H:%M:%S %z", time.localtime(seconds))
 
 

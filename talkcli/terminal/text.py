@@ -70,11 +70,14 @@ class Screen:
     boot: str = ""
 
     def columns_left(self, taken: int) -> int | None:
-        """Return how many columns remain if `taken` are used, or None if lines have no limit."""
+        """Return how many columns remain after `taken` columns.
+
+        Return None if the length of lines is unlimited.
+        """
         return None if self.width is None else max(self.width, MIN_COLUMNS) - taken
 
     def fit_name(self, name: str, min_columns: int = _MIN_NAME_COLUMNS, width_divisor: int = 4) -> str:
-        """Escape a name, and cut it to a fraction of the line, but not below `min_columns`.
+        """Escape a name, and cut it to a fraction of the terminal's width.
 
         Args:
             name: the name or the id.
@@ -102,7 +105,7 @@ class Screen:
 
 
 def printable(text: str, limit: int | None = None) -> str:
-    """Cut a text after `limit` characters, and escape the invisible characters in it."""
+    """Cut a text to `limit` characters, and escape invisible characters."""
     kept = text[:limit]
     if not (kept.isascii() and kept.isprintable() and "\\" not in kept):
         kept = "".join(map(_escape, kept))
@@ -151,7 +154,7 @@ def pad(text: str, columns: int) -> str:
 
 
 def longest_fitting(forms: Sequence[str], columns: int | None) -> str:
-    """Return the longest text that fits, or the shortest text cut to fit.
+    """Return the longest text that fits. If none fits, cut the shortest one.
 
     `forms` must be sorted from the longest text to the shortest.
     """
@@ -159,7 +162,7 @@ def longest_fitting(forms: Sequence[str], columns: int | None) -> str:
 
 
 def room_beside(text: str, columns: int, screen: Screen) -> int:
-    """Return how many of `columns` may be used for the details beside a text.
+    """Return how many columns the details beside a text may take up.
 
     The details leave at least half of the line to the text, or 16 columns if whole ids are shown.
     """
@@ -256,7 +259,7 @@ class MeasuredText:
         return "".join(self._shown[start:end])
 
     def _first_shown(self, column: int, max_index: int) -> int:
-        """Return the index of the first visible character that starts to the right of `column`.
+        """Return the index of the first character to show to the right of `column`.
 
         Return `max_index` if no earlier character does.
         """

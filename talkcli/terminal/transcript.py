@@ -48,7 +48,7 @@ _MAX_REMEMBERED_GOALS = 1000
 
 
 class ColumnWidths:
-    """Column widths that grow with the content of the columns.
+    """The widths of columns that grow with their content.
 
     Transcripts can share them to align their lines.
     """
@@ -57,7 +57,7 @@ class ColumnWidths:
         self._ids, self._robots = _FIRST_ID_COLUMNS, _FIRST_NAME_COLUMNS
 
     def pad_robot(self, name: str, screen: Screen) -> str:
-        """Pad a robot's name, and widen its column if necessary.
+        """Pad a robot's name. Widen its column if necessary.
 
         The name takes up at most a sixth of the terminal.
         """
@@ -66,7 +66,7 @@ class ColumnWidths:
         return pad(shown, self._robots)
 
     def pad_goal_id(self, goal_id: str, screen: Screen) -> str:
-        """Shorten and pad a goal id, and widen its column if necessary."""
+        """Shorten and pad a goal id. Widen its column if necessary."""
         shown = screen.goal_id(goal_id)
         self._ids = max(self._ids, _FIRST_NAME_COLUMNS * screen.long, min(width(shown), _MAX_NAME_COLUMNS))
         return pad(shown, self._ids)
@@ -106,7 +106,7 @@ class Transcript:
         self._widths = widths or ColumnWidths()
 
     def lines(self, event: Event, screen: Screen, now: float) -> list[str]:
-        """Return the lines that show an event, and remember its goal.
+        """Store an event's goal. Return the lines that show the event.
 
         `now` is shown if the event has no time.
         """
@@ -126,13 +126,13 @@ class Transcript:
         return []  # results aren't shown
 
     def _format_word(self, event: WordHeard, screen: Screen, now: float) -> list[str]:
-        """Record that a word was heard. If words are shown, return a line with the word."""
+        """Record that a word was heard. Return a line for the word if words are shown."""
         self._heard.add(event.id)
         word = f"{printable(event.word)}{COLUMN_GAP}{event.time:.2f} s"
         return [self._head_columns(event.at or now, "word", None, event.id, screen) + word] * self._with_words
 
     def _format_snapshot(self, event: Snapshot, screen: Screen, now: float) -> list[str]:
-        """Remember the server's state, and return the lines that show it."""
+        """Store the server's state. Return the lines that show it."""
         status = event.status
         goals = unfinished(status)
         for goal in goals:
@@ -150,7 +150,7 @@ class Transcript:
         return lines
 
     def _format_state_change(self, event: StateChanged, screen: Screen, now: float) -> list[str]:
-        """Return the lines that show a goal's new state, and remember the goal until it ends."""
+        """Update a stored goal after a state change. Return the lines that show it."""
         if event.goal is not None:
             self._goals[event.id] = event.goal
             if len(self._goals) > _MAX_REMEMBERED_GOALS:  # the event for the end of the oldest goal was probably missed
@@ -170,7 +170,7 @@ class Transcript:
         return self._format_goal(goal, event.state, at, screen)
 
     def _format_growth(self, event: TextAdded | TextMissing, screen: Screen, now: float) -> list[str]:
-        """Record added text, and return the lines that show its new sentences.
+        """Record added text. Return the lines that show its new sentences.
 
         If the goal waits for text, return a line that says so.
 
@@ -193,7 +193,7 @@ class Transcript:
         return lines
 
     def _format_pause(self, event: PausedChanged, screen: Screen, now: float) -> str:
-        """Remember whether speech is paused, and return a line that says so."""
+        """Store whether speech is paused. Return a line that says so."""
         self._paused = event.paused
         name = "paused" if event.paused else "resumed"
         head = self._head_columns(event.at or now, name, State.PREEMPTING, event.id or "", screen)
@@ -220,14 +220,14 @@ class Transcript:
         return [fit_row(head, text, forms, columns * 3 // 4, screen)]
 
     def _head_columns(self, timestamp: float, label: str, state: State | None, goal_id: str, screen: Screen) -> str:
-        """Return a line's columns up to the goal's id, with the label in the state's colour."""
+        """Return the columns of a line from the time to the goal's id."""
         robot = [] if self._robot is None else [self._widths.pad_robot(self._robot, screen)]
         cells = (screen.coloured(pad(label, 10), state), self._widths.pad_goal_id(goal_id, screen))
         return COLUMN_GAP.join((clock_time(timestamp), *robot, *cells, ""))
 
 
 def _last_sentence_end(text: str, start: int) -> int:
-    """Return the offset after the last complete sentence, or `start` if there is none.
+    """Return the end of the last complete sentence, or `start` if there is none.
 
     The search begins at the offset `start`.
     """

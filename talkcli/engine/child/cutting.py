@@ -112,7 +112,7 @@ class GrowingText:
 
     @property
     def finished(self) -> bool:
-        """Whether the text has ended and all of it was passed to the synthesizer."""
+        """Whether the text is complete and the synthesizer has received all of it."""
         return self.ended and not self.text[self._position :].strip()
 
     def append(self, text: str, now: float) -> None:
@@ -132,7 +132,7 @@ class GrowingText:
         self.text, self._position, self.ended = self.text[: self._position], position, True
 
     def take_next_part(self, now: float, buffered_s: float) -> tuple[int, int] | None:
-        """Take the next part of the text. Return its offsets, or None if it is too early to cut.
+        """Take the next part of the text. Return its offsets, if it can be cut now.
 
         If the text is complete, the rest of it is one part. Blanks between parts are skipped.
 
@@ -163,7 +163,7 @@ class GrowingText:
         return float("inf")
 
     def _find_part_end(self, now: float, silent_at: float) -> int | None:
-        """Skip blanks. Return the end of the next part, or None if it is too early to cut.
+        """Skip blanks. Return the end of the next part, if it can be cut now.
 
         Args:
             now: the current time.
@@ -193,7 +193,7 @@ class GrowingText:
         return _find_gap(text, start, longest) if waited == _LONG_WAIT else None
 
     def _find_sentence_end(self, waited: int) -> int | None:
-        """Return the end of the next sentence, or None if the sentence may still go on.
+        """Return the end of the next complete sentence, if there is one.
 
         `waited` says how long the text has stayed the same. It is one of the constants such as `_SHORT_WAIT`.
         """
@@ -209,7 +209,7 @@ class GrowingText:
 
 
 def _required_wait(text: str, start: int, stop: re.Match[str]) -> int:
-    """Return how long to wait for more text before a sentence may end at `stop`.
+    """Return how long to wait for more text before ending a sentence at `stop`.
 
     The sentence begins at `start`, and `stop` is a match of `_SENTENCE_END`. The result is one of the constants
     such as `_SHORT_WAIT`.
@@ -234,7 +234,7 @@ def _required_wait(text: str, start: int, stop: re.Match[str]) -> int:
 
 
 def _required_abbreviation_wait(text: str, next_start: int, kind: str) -> int:
-    """Return how long to wait for more text before a sentence may end at an abbreviation.
+    """Return how long to wait for more text before ending a sentence at an abbreviation.
 
     `next_start` is the offset of the text after it, and `kind` is the name of its group in `_ABBREVIATION`.
     """
@@ -246,7 +246,7 @@ def _required_abbreviation_wait(text: str, next_start: int, kind: str) -> int:
 
 
 def _find_gap(text: str, start: int, limit: int) -> int | None:
-    """Return the offset of the last gap between words before `limit`, or None if there is none.
+    """Return the offset of the last gap between words before `limit`, if any.
 
     The text before the gap must not be too short.
     """
@@ -255,7 +255,7 @@ def _find_gap(text: str, start: int, limit: int) -> int | None:
 
 
 def _find_break(text: str, start: int, limit: int) -> int:
-    """Return the best offset before `limit` at which to break a sentence that is too long."""
+    """Return the best offset for breaking a long sentence before `limit`."""
     found = _CLAUSE_END.finditer(text, start + _CLAUSE_CHARS - 1, limit)
     clauses = [each.end() for each in found if each.end() < limit]
     place = clauses[-1] if clauses else _find_gap(text, start, limit)

@@ -171,7 +171,7 @@ class DriverProperties:
         engine.connect("error", self._record_error)
 
     def apply(self, command: protocol.Speak) -> str | None:
-        """Set the properties for a goal. Return the reason for a fallback voice, if one is used.
+        """Set the properties for a goal. Return the reason for a fallback voice, if any.
 
         A neural voice may have disappeared since the goal was accepted. The driver then falls back to another of its
         voices, preferably in the same language. It doesn't do so if `voice_only` is set.
@@ -232,7 +232,7 @@ class DriverProperties:
         return found.id
 
     def _set_property(self, name: str, value: Any, label: str) -> None:
-        """Set a property of the engine. If this fails, raise CannotSpeak with `label` in the message.
+        """Set a property of the engine. Raise CannotSpeak if this fails.
 
         pyttsx3 reports errors through notifications. This method raises them as exceptions. In their messages, `label`
         names the property and its value.
@@ -275,7 +275,7 @@ class Driver:
         self._playback: Playback | None = None
 
     def iterate(self) -> Iterator[None]:
-        """Speak each stored text, and yield whenever none is left."""
+        """Speak each stored text. Yield while there is no text."""
         while True:
             if self._text is None:
                 self._proxy.setBusy(False)  # pyttsx3 sends no text while the driver is busy
@@ -326,7 +326,7 @@ class Driver:
             self._sound = replace(self._sound, **{name: kind(value)})
 
     def _speak(self, text: str) -> None:
-        """Speak a text, notify pyttsx3 of each step, and store the results in the runner."""
+        """Speak a text. Notify pyttsx3, and store the results in the runner."""
         runner = self._runner
         self._proxy.notify("started-utterance")
         self._playback = playback = Playback(runner, self._notify_word)
@@ -348,7 +348,7 @@ class Driver:
         self._proxy.notify("finished-utterance", completed=runner.duration is not None)
 
     def _parts(self, text: str, playback: Playback) -> Iterator[tuple[str, bool]]:
-        """Yield each part of a text as soon as it can be spoken, and whether it is the last one.
+        """Yield each part of a text once it can be spoken. A flag marks the last part.
 
         A text that doesn't grow is a single part. While text is missing, the playback continues.
         """

@@ -112,7 +112,7 @@ class SentenceSamples:
         self._quiet = self._quiet + len(samples) if quiet_count is None else quiet_count * SAMPLE_BYTES
 
     def leading_zeros(self) -> int:
-        """Return how many bytes at the start of the buffer are zero samples."""
+        """Return the number of zero bytes at the start of the buffer."""
         return (len(self._kept) - len(self._kept.lstrip(b"\0"))) // SAMPLE_BYTES * SAMPLE_BYTES
 
     def part(self, begin: int, end: int) -> memoryview:
@@ -128,7 +128,7 @@ class SentenceSamples:
         self.begin = offset
 
     def trailing_silence(self, limit: int) -> int:
-        """Return how many bytes at the end of the buffer are silent, at most `limit`."""
+        """Return the number of silent bytes at the end of the buffer, up to `limit`."""
         return min(self._quiet, limit, len(self._kept))
 
 
@@ -156,7 +156,7 @@ class PlayerFeed:
         self.progress_at = time.monotonic()
         self._rate = rate
         self._clock = clock
-        #: time at which the stream began, plus the time for which the player was silent because text was missing
+        #: time at which the stream began. Each wait for missing text moves it forward by the length of the wait.
         self.began_at = 0.0
         #: time at which everything written will have been heard
         self._heard_at = 0.0
@@ -181,7 +181,7 @@ class PlayerFeed:
         return taken
 
     def offer_silence(self, position: float, max_bytes: int | None = None) -> int:
-        """Offer silence to the player before a position in the audio. Return the number of bytes accepted.
+        """Offer silence to the player. Return the number of bytes accepted.
 
         Args:
             position: position in the audio of the next sample, in seconds.
@@ -215,7 +215,7 @@ class PlayerFeed:
         return max(0.0, self.time_left(self.written, now))
 
     def time_left(self, byte_count: int, now: float) -> float:
-        """Return the number of seconds until the first `byte_count` bytes have been heard.
+        """Return how many seconds it takes until `byte_count` bytes have been heard.
 
         The result is negative if they have already been heard.
         """
@@ -277,7 +277,7 @@ class Playback:
         self._skipped = 0
         #: monotonic time at which to stop retrying a busy device; 0 if no device was busy
         self._busy_until = 0.0
-        #: whether another thread synthesizes the samples, so that they may be late
+        #: whether another thread synthesizes the samples. They may then be late.
         self._in_background = False
         #: whether the player may have run dry because the text was missing, which doesn't count as a gap
         self._text_was_missing = False
@@ -327,7 +327,9 @@ class Playback:
         self._clock.add(TimedWord(self._part_start + start, length, self._seconds(self._part_begin) + position))
 
     def write(self, samples: bytes) -> None:
-        """Send samples to the player, and wait until it has accepted them. Hold back silence at the end.
+        """Send samples to the player, and wait until it has accepted them.
+
+        Silence at the end is held back.
 
         If all samples so far are silent, they are stored until the first sound follows.
         """
@@ -347,7 +349,7 @@ class Playback:
     # -- methods for the driver
 
     def begin_part(self, start: int, *, is_last: bool) -> None:
-        """Record that the next samples belong to the part of the text that begins at `start`."""
+        """Begin a new part of the text. The next samples belong to this part."""
         self._part_start, self._part_begin, self._part_follows = start, self._samples.end, not is_last
 
     def buffered(self) -> float:
@@ -362,7 +364,7 @@ class Playback:
         return max(0.0, self._feed.buffered(time.monotonic()) + unsent - MIN_PLAYER_BUFFER_S)
 
     def await_text(self, until: float) -> None:
-        """Keep playing until more text may have arrived or time is up."""
+        """Keep playing while waiting for more text, at most until `until`."""
         self._text_was_missing = True
         self._keep_playing(until=until)
 
@@ -423,7 +425,7 @@ class Playback:
     # -- choosing a player
 
     def _with_player(self, step: Callable[[PlayerFeed], None]) -> None:
-        """Call `step` with a player. If the player fails, try the next one.
+        """Call `step` with the current player. If that player fails, try the next one.
 
         The next player is tried only if no sound was heard yet, or if the sentence is paused. If the player was
         released during a pause, a new one is opened.
@@ -483,13 +485,13 @@ class Playback:
         return time.monotonic() < self._busy_until
 
     def _replace_player(self, resume_at: int) -> None:
-        """Kill the player. The best available player then continues the sentence at `resume_at`."""
+        """Kill the player. The best available player continues the sentence at `resume_at`."""
         self._begin = self._sent = resume_at
         self._untried = self._first_error = None
         self.silence()
 
     def _release_and_rewind(self, feed: PlayerFeed) -> None:
-        """Kill a player, and rewind the sentence to the first sound that may not have been heard."""
+        """Kill a player. Rewind the sentence to the first sound that may be unheard."""
         feed.update(time.monotonic(), all_written=False)
         self._replace_player(self._unheard_begin() if feed.player.proven else self._begin)
 
@@ -555,7 +557,7 @@ class Playback:
     # -- samples
 
     def _skip_leading_zeros(self) -> bool:
-        """Skip silence before the first sound. Return False if it is too early to decide.
+        """Skip silence before the first sound. Return whether playback can start.
 
         Zeros before the first sound are skipped, so that the sentence is heard earlier. They are kept in a file. They
         are also kept after another sentence, because they are part of the silence between the two sentences.
@@ -591,7 +593,7 @@ class Playback:
         return taken
 
     def _only_silence_is_unsent(self) -> bool:
-        """Return whether all samples that the player hasn't accepted are silent."""
+        """Return whether all unsent samples are silent."""
         unsent = self._samples.end - self._sent
         return self._samples.trailing_silence(unsent) == unsent
 
@@ -621,7 +623,7 @@ class Playback:
         self._report_words(self._clock.pop_started(now) if player.real_time else self._clock.pop_all())
 
     def _report_words(self, words: list[TimedWord]) -> None:
-        """Report words, with their positions relative to the first sample played."""
+        """Report words. Their positions are relative to the first sample played."""
         for word in words:
             self._on_word(replace(word, position=word.position - self._seconds(self._skipped)))
 
@@ -695,7 +697,7 @@ class Playback:
         return taken
 
     def _has_enough_silence(self, feed: PlayerFeed) -> bool:
-        """Return whether the sentence is paused and the player has enough zeros for now."""
+        """Return whether the sentence is paused and the player has enough silence."""
         return bool(self._runner.hold_number) and feed.buffered(time.monotonic()) >= HOLD_SILENCE_LIMIT_S
 
     # -- waiting
@@ -744,7 +746,7 @@ class Playback:
         self._wait([*interests, *other_interests], until)
 
     def _wait(self, interests: Sequence[Interest] = (), until: float = NEVER) -> None:
-        """Execute commands while waiting, and raise Stopped if the sentence was stopped."""
+        """Wait, and execute commands meanwhile. Raise Stopped if the sentence was stopped."""
         self._runner.wait(interests, until)
         self._raise_if_stopped()
 

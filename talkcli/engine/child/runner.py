@@ -147,7 +147,7 @@ class ActiveGoal:
         return self._markdown.read(text, ended=ended) if self._markdown else text
 
     def speech_seconds(self, now: float) -> float:
-        """Return for how many seconds a third-party driver has been speaking, not counting pauses."""
+        """Return how many seconds a third-party driver has spoken, without pauses."""
         return self.spoken_s + (now - self.resumed_at if self.with_driver else 0.0)
 
 
@@ -371,17 +371,17 @@ class GoalRunner:
                 self._send_to_driver(goal)
 
     def _send_to_driver(self, goal: ActiveGoal) -> None:
-        """Have the driver speak the text, starting at the last word heard."""
+        """Send the text to the driver, beginning at the last word heard."""
         goal.progress_at = goal.resumed_at = time.monotonic()
         goal.offset = goal.last_word
         goal.with_driver, goal.interrupted = True, False
-        # The first piece of a growing text may contain only marks, but pyttsx3 refuses blanks. The driver ignores it.
+        # pyttsx3 refuses blanks, so a growing text is sent with its marks. The driver ignores this text anyway.
         text = goal.command.text if goal.growing_text else goal.text[goal.offset :]
         if self._engine.say(text, goal.id) is not None:
             self._fail_goal(Reason.NOTHING_TO_SAY, "nothing in the text can be spoken")
 
     def _step_driver(self, goal: ActiveGoal) -> None:
-        """Run one step of the driver, and fail the goal if the driver has dropped its text.
+        """Run one step of the driver. Fail the goal if the driver has dropped its text.
 
         `talk`'s own driver speaks the whole text in one step. A third-party driver needs many steps.
         """
@@ -399,7 +399,7 @@ class GoalRunner:
             self._step_run_loop()
 
     def _report_word(self, location: int, length: int, **_: object) -> None:
-        """Report the word at a location in the text, unless it was already reported.
+        """Report the word at a location in the text. Report each word only once.
 
         The notification's `name` is not compared with the goal's ID, because some drivers set it to the word.
         """
@@ -455,7 +455,10 @@ class GoalRunner:
         self._channel.send(ended)
 
     def _alive_due(self) -> float:
-        """Return when to send the next heartbeat, or NEVER if the process is idle or hangs."""
+        """Return the time of the next heartbeat, or NEVER if none is needed.
+
+        None is sent while the process is idle or a driver hangs.
+        """
         loader = self._synthesizer.loader if self._synthesizer else None
         loading = loader is not None and loader.descriptor is not None
         if not loading and (self._goal is None or self._notice_overdue(self._goal)):
@@ -463,7 +466,7 @@ class GoalRunner:
         return self._channel.sent_at + protocol.ALIVE_INTERVAL_S
 
     def _notice_overdue(self, goal: ActiveGoal) -> bool:
-        """Return whether a third-party driver is taking too long. Log this once for each goal.
+        """Return whether a third-party driver takes too long. Log the first time for each goal.
 
         The process then sends no `Alive`, so that the server kills it. There may be no other way to stop the driver.
         """
@@ -486,7 +489,10 @@ def _make_markdown_reader() -> MarkdownReader:
 
 
 def _make_growing_text(text_so_far: str, command: protocol.Speak) -> GrowingText:
-    """Create a GrowingText. If the sender broke off, leave out an incomplete last sentence."""
+    """Create a GrowingText for a goal.
+
+    If the text broke off, an incomplete last sentence is left out.
+    """
     from talkcli.engine.child.cutting import GrowingText  # rarely needed, and slow to import
 
     text = GrowingText(text_so_far, ended=False)
@@ -496,7 +502,7 @@ def _make_growing_text(text_so_far: str, command: protocol.Speak) -> GrowingText
 
 
 def _with_traceback(callback: Callable[..., None]) -> Callable[..., None]:
-    """Return a callback that prints a traceback instead of raising an exception."""
+    """Return a version of a callback that prints its exceptions instead of raising them."""
 
     def call(**values: Any) -> None:
         try:

@@ -21,7 +21,7 @@ _END_MARKS = ".,;:!?…"
 
 
 def count_letters(text: str, start: int) -> int:
-    """Count the consecutive letters, digits and combining accents from `start` on.
+    """Count the consecutive letters, digits and accents that begin at `start`.
 
     The result is used as the length of a word if libespeak-ng reports a length of 0. libespeak-ng does so if the next
     character isn't ASCII (as in "«hello»"), and also if there is no word at all.
@@ -47,7 +47,7 @@ class WordFinder:
         self._count = 0
 
     def find(self, location: int, length: int) -> tuple[int, int, int] | None:
-        """Return the start, end and number of the word at a location, or None if the word isn't new.
+        """Find the word at a location. Return its start, end and number if it is new.
 
         The first word has number 1.
         """
@@ -68,7 +68,7 @@ class WordFinder:
         return start, self._end, self._count
 
     def _whole_end(self, start: int, end: int) -> int:
-        """Return the end of a whole word, given the part of it that was reported."""
+        """Return where a word ends, given the part that the synthesizer reported."""
         text = self.text
         if end == len(text) or text[end].isspace():
             return start + len(text[start:end].rstrip(_END_MARKS) or text[start:end])
@@ -89,7 +89,7 @@ class TimedWord:
 
 
 class WordClock:
-    """Keeps track of how much audio has been heard, and of which words have started.
+    """Tracks how much audio has been heard and which words have started.
 
     The clock measures the stream to one player. It starts when the player accepts the first samples. It is set back if
     the player falls behind, so that no word is reported before it is heard. If the output has its own clock, this clock
@@ -124,7 +124,7 @@ class WordClock:
         self._started_at = now
 
     def add_silence(self, position: float, seconds: float) -> None:
-        """Record silence in the stream before this position in the audio.
+        """Record that silence is played before this position in the audio.
 
         Positions must not decrease.
         """
@@ -158,7 +158,7 @@ class WordClock:
         return position
 
     def next_word_at(self) -> float:
-        """Return the time at which the next word starts, or infinity if there is none."""
+        """Return the start time of the next word, or infinity if there is none."""
         if self._started_at is None or not self._waiting:
             return float("inf")
         position = self._waiting[0].position

@@ -70,7 +70,7 @@ class EngineProcess:
         self.ready = False
         #: whether the process has sent an event about a goal; set by the supervisor
         self.had_goal = False
-        #: commands, or parts of them, for which the socket had no room
+        #: commands that are waiting for room in the buffer of the socket
         self._unsent = bytearray()
         self._lines = LineSplitter()
         self._stderr_lines = LineSplitter(MAX_STDERR_LINE_BYTES)
@@ -102,23 +102,23 @@ class EngineProcess:
         self.send(configure)
 
     def send(self, command: protocol.Command) -> None:
-        """Send a command, or keep it until the process has read earlier ones."""
+        """Send a command. If the process is busy, keep the command for later."""
         self._unsent += protocol.encode(command)
         self._flush()
 
     def _flush(self) -> None:
-        """Send as much of the waiting commands as possible, without blocking."""
+        """Send waiting commands until the socket is full."""
         with contextlib.suppress(OSError):  # the buffer is full, the process is dead, or memory is short
             while self._unsent:
                 del self._unsent[: self.socket.send(self._unsent)]
 
     @property
     def socket_events(self) -> int:
-        """The poll events after which `receive` must be called."""
+        """The poll events to wait for before calling `receive`."""
         return select.POLLIN | (select.POLLOUT if self._unsent else 0)
 
     def receive(self) -> Iterator[protocol.Event | None]:
-        """Send waiting commands, and yield the events that have arrived, without blocking.
+        """Send waiting commands. Yield the events that have arrived, without blocking.
 
         The last one is None if the connection has ended. A malformed message counts as the end of the connection.
         """
@@ -150,7 +150,7 @@ class EngineProcess:
         return bool(data)
 
     def _report_stderr(self, data: bytes) -> None:
-        """Pass each complete line to `on_stderr_line`, and remember the last one."""
+        """Pass each complete line to `on_stderr_line`. Store the last line."""
         for line in self._stderr_lines.feed(data):
             text = line.decode(errors="replace").rstrip()
             if text:

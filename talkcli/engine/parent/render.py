@@ -132,7 +132,7 @@ def render(
 
 
 def split_into_pieces(text: str) -> Iterator[str]:
-    """Split a text into pieces, at the end of a sentence or a word if possible."""
+    """Split a text into pieces. Prefer the end of a sentence or a word."""
     start = 0
     while len(text) - start > MAX_PIECE_CHARS:
         limit = start + MAX_PIECE_CHARS
@@ -175,7 +175,7 @@ def _speak_all(engine: PrivateEngine, commands: Iterator[protocol.Speak], engine
 
 
 def _convert_engine_error(error: EngineFailed, speaking_voice: str | None) -> RenderFailed:
-    """Convert an EngineFailed to a RenderFailed, and name the voice that was speaking."""
+    """Convert an EngineFailed to a RenderFailed. Name the voice that was speaking."""
     while_speaking = "" if speaking_voice is None else f' while it spoke with the voice "{speaking_voice}"'
     if error.reason == Reason.ENGINE_CRASHED:
         return RenderFailed(error.reason, f"the engine crashed{while_speaking}: {error}")
@@ -221,7 +221,7 @@ def _is_stream(path: str) -> bool:
 
 @contextlib.contextmanager
 def _open_output(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> Iterator[int]:
-    """Open standard output, a pipe or a device for a `with` block, but refuse a terminal."""
+    """Open standard output, a pipe or a device for a `with` block. Refuse terminals."""
     output_fd = os.dup(1) if path in STANDARD_OUTPUT else _open_pipe_or_device(path, deadline, interrupt)
     try:
         if os.isatty(output_fd):
@@ -253,7 +253,7 @@ def _open_pipe_or_device(path: str, deadline: float, interrupt: Mapping[int, int
 
 @contextlib.contextmanager
 def _hidden_file(path: str) -> Iterator[str]:
-    """Create a hidden file, which replaces the file at `path` after the `with` block.
+    """Create a hidden file. After the `with` block, it replaces the file at `path`.
 
     After an error, remove it.
     """

@@ -58,7 +58,7 @@ class EngineMissing:
 
 @frozen
 class EngineSaid:
-    """A line from the engine process's standard error, for the log.
+    """A line that the engine process wrote to standard error.
 
     It may contain parts of a goal's text.
     """
@@ -68,7 +68,7 @@ class EngineSaid:
 
 @frozen
 class ThreadDied:
-    """A bug has ended the engine thread. No more goals can be spoken."""
+    """The engine thread has crashed. No more goals can be spoken."""
 
     message: str
 
@@ -140,7 +140,7 @@ class RestartPolicy:
             self._back_off(now)
 
     def start_failed(self, now: float, started_at: float, permanent_error: str | None) -> bool:
-        """Schedule the next start after a failed one. Return whether waiting goals must fail now.
+        """Schedule the next start after a failed start. Return whether waiting goals must fail.
 
         They must fail if they have waited too long for an engine.
 
@@ -211,7 +211,7 @@ class Supervisor:
         self._loading: str | None = None
         #: time of the last event from the process, or of the last command that it must answer
         self._last_sign_at = 0.0
-        #: killed processes that may not have exited yet, and the time by which they must have exited
+        #: killed processes that may still be running, each with the time limit for its exit
         self._dying: dict[EngineProcess, float] = {}
         self._stderr_quota = RateLimit(MAX_STDERR_LINES, STDERR_PERIOD_S)
         self._closing = False
@@ -238,7 +238,7 @@ class Supervisor:
         self._actions.call(lambda: self._stop_goal(goal_id))
 
     def pause(self, goal_id: str, number: int) -> None:
-        """Pause the goal, and post `Held` with this number once it is silent.
+        """Pause the goal. Post `Held` with this number once the goal is silent.
 
         Nothing is posted if the goal is being stopped.
         """
@@ -362,11 +362,14 @@ class Supervisor:
     # -- goals
 
     def _current_goal(self, goal_id: str) -> SupervisedGoal | None:
-        """Return the current goal if it has this ID, otherwise None."""
+        """Return the current goal if it has this ID."""
         return self._goal if self._goal and self._goal.command.id == goal_id else None
 
     def _begin_goal(self, command: protocol.GoalCommand) -> None:
-        """Make this the current goal. Send it to the process, or fail it if no process can start."""
+        """Make this the current goal, and send it to the process.
+
+        If no process can start, the goal fails.
+        """
         self._goal = SupervisedGoal(command)
         if self._restarts.permanent_error is not None:
             self._fail_goal(self._goal, Reason.ENGINE_FAILED, self._restarts.permanent_error)
@@ -421,7 +424,7 @@ class Supervisor:
             self._send_waiting_goal()
 
     def _stop_goal(self, goal_id: str) -> None:
-        """Tell the process to stop the goal, or end a goal that the process doesn't have."""
+        """Stop the goal. If it wasn't sent to the process, end it at once."""
         goal = self._current_goal(goal_id)
         if goal is None or goal.stop_due != NEVER:
             return
@@ -454,7 +457,7 @@ class Supervisor:
     # -- the process
 
     def _start_process(self) -> None:
-        """Start an engine process, or schedule another start if this fails."""
+        """Start an engine process. If this fails, schedule another attempt."""
         self._started_at = time.monotonic()
         try:
             process = EngineProcess(self._configure, self._report_stderr)
@@ -467,7 +470,7 @@ class Supervisor:
         self._watched |= dict.fromkeys((process.socket.fileno(), process.liveness, process.stderr), process)
 
     def _report_stderr(self, line: str) -> None:
-        """Post a line of a process's standard error, unless there have been too many."""
+        """Post a line of a process's standard error. Drop it if there have been too many."""
         omitted = self._stderr_quota.count_event(time.monotonic())
         if omitted:
             self._post(EngineSaid(f"({omitted} lines were omitted)"))
@@ -507,7 +510,7 @@ class Supervisor:
         self._send_waiting_goal()
 
     def _handle_goal_event(self, goal: SupervisedGoal, event: protocol.GoalEvent) -> None:
-        """Update the goal after an event about it, and pass the event on if others need it."""
+        """Update the goal after an event. Post the event if others need it."""
         if isinstance(event, protocol.Started):
             goal.started = True
         elif isinstance(event, protocol.Ended):
@@ -519,7 +522,7 @@ class Supervisor:
             self._post(event)
 
     def _lose_process(self, message: str, reason: Reason, failure: protocol.StartFailed | None = None) -> None:
-        """Kill the process, retry or end its goal, and schedule the next start.
+        """Kill the process. Retry or end its goal, and schedule the next start.
 
         Args:
             message: a human-readable description of what happened.
@@ -545,7 +548,7 @@ class Supervisor:
             self._handle_failed_start(message, permanent=failure is not None and failure.permanent)
 
     def _handle_lost_goal(self, goal: SupervisedGoal, process: EngineProcess, message: str, reason: Reason) -> None:
-        """Handle a goal whose process was lost. Retry the goal, or end it once the process has exited.
+        """Retry a goal whose process was lost. If it can't be retried, end it after the process exits.
 
         If the process crashed before it started the goal, nothing was heard, so the goal is sent to the next process.
         Each goal is retried only once.

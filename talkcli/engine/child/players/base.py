@@ -101,7 +101,7 @@ class Player(Protocol):
         """
 
     def heard(self) -> float | None:
-        """Return how many seconds of the stream have been heard, or None if the output has no clock.
+        """Return how many seconds of the stream have been heard, if the output has a clock.
 
         The result is 0 until the first sample is heard. If there is a clock, words and pauses follow it instead of
         `consumed`.
@@ -134,7 +134,7 @@ class Player(Protocol):
         """
 
     def wake_at(self) -> float:
-        """Return when to check the player again, or NEVER if polling is enough.
+        """Return the time of the next check, or NEVER if polling is enough.
 
         The result is a time of the monotonic clock.
         """

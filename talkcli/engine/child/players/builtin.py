@@ -59,7 +59,7 @@ class BuiltInPlayer(Player):
         return ()
 
     def wake_at(self) -> float:
-        """Return 0, so that the player is checked again at once."""
+        """Return 0, because this player is checked again at once."""
         return 0.0
 
     def kill(self) -> None:
@@ -89,7 +89,7 @@ class NullPlayer(BuiltInPlayer):
         self._end_time = 0.0
 
     def offer(self, data: memoryview) -> int:
-        """Accept all samples if the simulated buffer has room, otherwise none.
+        """Accept all samples if the simulated buffer has room for them.
 
         Return the number of bytes accepted.
         """
@@ -106,7 +106,10 @@ class NullPlayer(BuiltInPlayer):
         return self._closed and self._clock() >= self._end_time
 
     def wake_at(self) -> float:
-        """Return when the simulated buffer will have room. After `close`, return when it will be empty."""
+        """Return when to check the simulated buffer again.
+
+        This is when it has room or, after `close`, when it is empty.
+        """
         # At this time, a third of the buffer is free, so this player wakes up no more often than a real one.
         return self._end_time if self._closed else self._end_time - NULL_AHEAD_S * 2 / 3
 
@@ -215,7 +218,7 @@ class WavStreamPlayer(BuiltInPlayer):
 
 @contextlib.contextmanager
 def _convert_os_errors(reason: Reason, subject: str) -> Iterator[None]:
-    """Convert an OSError raised in a `with` block to CannotSpeak."""
+    """Raise CannotSpeak instead of any OSError in a `with` block."""
     try:
         yield
     except OSError as error:

@@ -45,7 +45,7 @@ MAX_HANDOVER_S = 0.5
 
 
 class HandoverTimes:
-    """Measures the delays between sentences, and makes up for them by cutting silence.
+    """Measures the delays between sentences, and shortens silence to compensate.
 
     A handover is the time between the last sample of one sentence and the first sample of the next. During a handover,
     the player drains and exits, the server gets the result, and the next sentence starts. This would lengthen the pause
@@ -75,7 +75,7 @@ class HandoverTimes:
         return min(MAX_CUT_S, measured[len(measured) // 2]) if measured else 0.0
 
     def sentence_ended(self, player_name: str, last_sample_at: float) -> None:
-        """Record when the last sample of a completed sentence is heard."""
+        """Record the time of a completed sentence's last sample."""
         self._previous = (player_name, last_sample_at) if self.next_waits else None
 
     def sentence_started(self, player_name: str, at: float, *, neural: bool = False) -> None:
@@ -144,7 +144,9 @@ class PlayerChooser:
         self.handovers.next_waits, self.handovers.next_is_neural = command.next_waits, command.next_is_neural
 
     def update_output(self, player: Player) -> None:
-        """Record a player's output, and its name if it works and was chosen automatically.
+        """Record the output of a player.
+
+        The player's name is recorded too if it works and was chosen automatically.
 
         A sentence that was ever muted counts as muted.
         """
@@ -171,7 +173,7 @@ class PlayerChooser:
         return milliseconds / 1000 if due else 0.0
 
     def find_first_player(self) -> str | None:
-        """Return the name of the player that would be tried first, or None if there is none.
+        """Return the name of the player that would be tried first, if any.
 
         Players that run in this process are opened and closed to test them.
         """

@@ -179,7 +179,7 @@ def _spawn(argv: tuple[str, ...], stdin: int, stderr: int, inherited: Sequence[i
 
 
 def _attach_leash(leash: int, group: int) -> None:
-    """Make the kernel kill a process group when the other end of a pipe is closed."""
+    """Make the kernel kill a process group when a pipe's other end is closed."""
     if not hasattr(fcntl, "F_SETSIG"):
         return
     with contextlib.suppress(OSError):  # if a sandbox forbids this, the program still exits when its input is closed
@@ -208,7 +208,7 @@ class ErrorOutput:
             self._examine_line(line)
 
     def find_error(self) -> str | None:
-        """Return the first line that looks like an error, or else the first line.
+        """Return the first line with an error. If there is none, return the first line.
 
         Return None if there are no lines.
         """
@@ -282,7 +282,7 @@ class ProgramPlayer(Player):
         return self._consumed
 
     def close(self) -> None:
-        """Close the program's standard input, so that it plays the rest and exits."""
+        """Close the program's standard input. The program plays the rest and exits."""
         self._closed = True
         self._process.stdin.close()
 
@@ -309,7 +309,7 @@ class ProgramPlayer(Player):
         return [(file.fileno(), events) for file, events in wanted if file is not None and not file.closed]
 
     def wake_at(self) -> float:
-        """Return when to check whether the program has exited, or NEVER if poll is enough."""
+        """Return the time of the next check for the program's exit, or NEVER if polling is enough."""
         return time.monotonic() + EXIT_CHECK_S if self._process.exit is None else self._exit_due
 
     def kill(self) -> None:

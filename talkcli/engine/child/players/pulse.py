@@ -138,12 +138,12 @@ class PulsePlayer(Player):
         return length
 
     def consumed(self) -> int:
-        """Return the number of bytes heard so far, by the server's clock."""
+        """Return how many bytes have been heard, according to the server's clock."""
         self.heard()
         return self._heard
 
     def heard(self) -> float | None:
-        """Return the number of seconds heard so far, by the server's clock."""
+        """Return how many seconds have been heard, according to the server's clock."""
         if self._drained:
             self._heard = self._written
         elif self._clock_report is not None:
@@ -183,7 +183,7 @@ class PulsePlayer(Player):
         return min(self._loop.wake_at, self._ready_by, self._resumed_by, self._time_request_at, settled_at)
 
     def kill(self) -> None:
-        """Close the connection, which makes the server drop the stream."""
+        """Close the connection. The server then drops the stream."""
         if self._loop.freed:
             return
         self._lib.context_disconnect(self._context)
@@ -225,7 +225,7 @@ class PulsePlayer(Player):
             pass
 
     def _advance_stream(self) -> bool:
-        """Check the connection and advance the stream. Return whether libpulse may have more work."""
+        """Check the connection, and advance the stream. Return whether to run libpulse again."""
         if self._error is not None or self._drained:
             return False
         state = self._lib.context_get_state(self._context)
@@ -270,7 +270,7 @@ class PulsePlayer(Player):
         return True
 
     def _follow_sink(self) -> bool:
-        """Handle a change or suspension of the sink. Return whether requests were sent."""
+        """Handle a changed or suspended sink. Return whether requests were sent."""
         index = int(self._lib.stream_get_device_index(self._stream))
         changed = index != self._sink_index
         if changed:
@@ -298,7 +298,7 @@ class PulsePlayer(Player):
         return changed
 
     def _request_time(self) -> bool:
-        """Request the playback time if a request is due. Return whether it was sent."""
+        """Request the playback time if this is due. Return whether a request was sent."""
         if time.monotonic() < self._time_request_at:
             return False
         self._time_request_at = NEVER
@@ -327,14 +327,17 @@ class PulsePlayer(Player):
         return 0 if room == libpulse.SIZE_ERROR else room // SAMPLE_BYTES * SAMPLE_BYTES
 
     def _is_volume_pending(self) -> bool:
-        """Return whether the server still has to set the real volume of the stream."""
+        """Return whether the stream's final volume is still unknown."""
         level = self._stream_level
         if level is None or level.volume > 0 or level.muted or self._drained:
             return False
         return self._pending_levels > 0 or time.monotonic() < self._volume_settled_at
 
     def _record_mute(self) -> None:
-        """If the output is silent, mark the sentence as muted or failed."""
+        """Mark the sentence as muted if the output is silent.
+
+        If the sentence must be audible, it fails.
+        """
         levels = [each for each in (self._sink_level, self._stream_level) if each is not None]
         if self._drained or self._is_volume_pending() or not any(each.muted or each.volume == 0 for each in levels):
             return

@@ -34,8 +34,8 @@ class SpeechSettings:
     volume: float = 1.0  # 0.0 to 1.0; 1.0 is the voice's natural volume
     pitch: int = 50  # 0 to 100; 50 is the voice's natural pitch
     voice_only: bool = False  # whether to fail if the voice can't be used, instead of using another one
-    begins_text: bool = True  # whether this is the first part of a text, so that silence before it may be cut
-    ends_text: bool = True  # whether this is the last part of a text, so that a pause follows even without a mark
+    begins_text: bool = True  # whether this is the first part of a text; silence before it may be cut
+    ends_text: bool = True  # whether this is the last part of a text; a pause follows even without a mark
 
 
 class SampleSink(Protocol):

@@ -33,7 +33,7 @@ class CombinedSynthesizer:
         self._current: Synthesizer = self._espeak
         self.version = self._espeak.version
         self.voice = self._espeak.voice
-        #: why libespeak-ng speaks the current text instead of the neural voice, or None
+        #: reason why libespeak-ng speaks the current text instead of a neural voice, if it does
         self._fallback_reason: str | None = None
 
     def voices(self) -> tuple[Voice, ...]:
@@ -90,7 +90,7 @@ class CombinedSynthesizer:
             loader.start(command.voice)
 
     def _get_piper(self) -> Piper:
-        """Return the synthesizer for neural voices, and create it on first use."""
+        """Return the synthesizer for neural voices. The first call creates it."""
         if self._neural is None:
             from talkcli.engine.child.synthesizers.piper import Piper
 

@@ -342,7 +342,10 @@ class EspeakPhonemizer:
         return with_pause - alone < _PAUSE_SAMPLES
 
     def end(self) -> None:
-        """Make the current call and all later ones raise Stopped. Any thread may call this."""
+        """Stop the phonemizer. The current call and all later ones raise Stopped.
+
+        Any thread may call this.
+        """
         self._ended = True
 
     @contextlib.contextmanager
@@ -360,7 +363,7 @@ class EspeakPhonemizer:
             raise Stopped
 
     def _speak_silently(self, text: str) -> tuple[list[tuple[int, int]], int]:
-        """Return the positions of a text's words, and the number of samples in its first clause."""
+        """Synthesize a text silently. Return its word positions and the number of samples in its first clause."""
         text = guard.guarded(text, self._voice)
         positions: list[tuple[int, int]] = []
         clause_ends: list[int] = []
@@ -380,7 +383,7 @@ class EspeakPhonemizer:
 
 
 def _word_position(event: _EspeakEvent, text: str) -> tuple[int, int] | None:
-    """Return the start and the length of an event's word, or None if the event has no word."""
+    """Return the start and length of the word in an event, if any."""
     start = event.text_position - 1
     length = event.length if event.length > 0 else count_letters(text, start)
     return (start, length) if length else None
@@ -409,7 +412,7 @@ def _has_mbrola_data(identifier: str) -> bool:
 
 
 def _list_voices(espeak: Any, kind: bytes | None) -> tuple[Voice, ...]:
-    """Return the library's voices of one kind, or the normal voices if `kind` is None."""
+    """Return the library's voices of one kind. None selects the normal voices."""
     found = []
     for each in espeak.ListVoices(None if kind is None else espeak.VOICE(languages=kind)):
         # The first byte of `languages` is a priority, not a part of the language.

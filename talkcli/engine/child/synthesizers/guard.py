@@ -104,13 +104,16 @@ def guarded(text: str, voice: str = "") -> str:
 
 
 def _unsafe_characters(language: str) -> re.Pattern[str]:
-    """Return a pattern for the characters that crash the voices of a language."""
+    """Return a regular expression for characters that crash a language's voices."""
     found = (signs for languages, signs in _CRASHING_CHARACTERS.items() if language not in languages)
     return re.compile(f"[{''.join(found)}]")
 
 
 def _split_number(number: str, min_digits: int, max_digits: int) -> str:
-    """Split a number of `min_digits` to `max_digits` digits by making one digit a superscript."""
+    """Split a long number by making one digit a superscript.
+
+    The number has `min_digits` to `max_digits` digits.
+    """
     if not min_digits <= sum(map(str.isdigit, number)) <= max_digits:
         return number
     middle = next(place for place in range(len(number) // 2, len(number)) if number[place].isdigit())

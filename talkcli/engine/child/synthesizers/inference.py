@@ -68,7 +68,7 @@ _CACHED_NAME = re.compile(r"[0-9a-f]{64}-.*(\.encoder\.onnx|\.decoder\.onnx|\.ne
 
 
 class ModelCache:
-    """A directory that caches models in two halves. Only this user can read and write it.
+    """A directory that caches the two halves of each model. Other users have no access.
 
     The encoder is stored after onnxruntime has optimized it. If a file is damaged or can't be written, the halves are
     made again, so voices work without the cache. A key consists of 64 hexadecimal digits, a hyphen and anything else.
@@ -98,7 +98,7 @@ class ModelCache:
         return paths
 
     def store(self, key: str, make_encoder: Callable[[str | None], Any], decoder_content: Iterable[Buffer]) -> Any:
-        """Create the encoder of a model, and cache both halves if possible. Return the encoder.
+        """Create and return the encoder of a model. Cache both halves if possible.
 
         Args:
             key: The key of the model.
@@ -156,7 +156,7 @@ class Frames:
 
 
 class ModelRun:
-    """A handle that can end all runs of a model for one sentence."""
+    """A handle to stop a model that is speaking a sentence."""
 
     def __init__(self) -> None:
         import onnxruntime
@@ -165,7 +165,7 @@ class ModelRun:
         self.options.log_severity_level = 4  # Log only fatal errors. Other errors raise exceptions.
 
     def end(self) -> None:
-        """Make the current run and all later ones raise an exception.
+        """Stop the model. The current run and all later ones raise an exception.
 
         Any thread may call this.
         """
@@ -313,7 +313,9 @@ class Model:
 
 
 def load_libraries(model_path: str) -> None:
-    """Import numpy and onnxruntime. Errors name the model that needs them.
+    """Import numpy and onnxruntime.
+
+    If this fails, the error names the model that needs them.
 
     This takes 0.25 s, and blocks all other threads for a tenth of that time.
 
@@ -383,7 +385,7 @@ def _create_session(model: str | bytes, save_optimized_to: str | None = None) ->
 
 
 def _model_error(path: str, problem: str, error: Exception, advice: str = "download the voice again") -> VoiceFileError:
-    """Convert an exception of onnxruntime to a VoiceFileError.
+    """Convert an onnxruntime error to a VoiceFileError.
 
     `advice` tells the user what to do next.
     """
@@ -394,10 +396,10 @@ def _model_error(path: str, problem: str, error: Exception, advice: str = "downl
 
 
 def no_memory_error(path: str) -> VoiceFileError:
-    """Return the error to raise if there isn't enough memory for a model."""
+    """Return the error for a model that doesn't fit into memory."""
     return VoiceFileError(f"{path} cannot be used: there is not enough memory; end another program")
 
 
 def _is_out_of_memory(error: BaseException | None) -> bool:
-    """Return whether an exception says that there isn't enough memory."""
+    """Return whether an exception was caused by a lack of memory."""
     return isinstance(error, MemoryError) or any(each in str(error) for each in _NO_MEMORY)

@@ -74,7 +74,7 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
         return bool(self._made)
 
     def take(self, wait: Callable[[int], None] | None = None) -> _T | None:
-        """Return the next item, or None if the iterator has ended.
+        """Wait for the next item. Return the item, or None at the end.
 
         Args:
             wait: A function that waits until the descriptor is readable, or for a shorter time. If it raises an
@@ -154,7 +154,7 @@ class ModelLoader:
         self.errors.pop(voice, None)
 
     def start(self, voice: str) -> None:
-        """Queue a voice for loading in the background, or report at once that it is loaded.
+        """Queue a voice for loading. If it is already loaded, report this at once.
 
         When the load begins, any earlier error of the voice is forgotten.
         """
@@ -166,7 +166,7 @@ class ModelLoader:
             self._start_next_load()
 
     def get_model(self, voice: str) -> Model | None:
-        """Return the model of a voice, or None if it isn't loaded. Handle a finished load first.
+        """Return the model of a voice if it is loaded. Handle a finished load first.
 
         If the voice has failed and its files have changed since then, unload it.
         """
@@ -179,7 +179,7 @@ class ModelLoader:
         return model
 
     def mark_spoken(self, voice: str) -> None:
-        """Schedule a memory measurement, because a voice has just spoken.
+        """Schedule a memory measurement after a voice has spoken.
 
         The first sentences with a voice need memory that is never freed.
         """
@@ -189,7 +189,7 @@ class ModelLoader:
             self._unmeasured = voice
 
     def take_events(self) -> list[VoiceLoaded | VoiceUnloaded | VoiceMemory]:
-        """Return and clear the new events. First handle a finished load, and measure memory if due."""
+        """Handle a finished load, and measure memory if due. Return and clear the new events."""
         self._finish_load()
         if self._unmeasured is not None:
             self._measure_memory(self._unmeasured, min_growth=GROWTH_BYTES)
@@ -258,7 +258,7 @@ def _fingerprints(path: str) -> _Fingerprints:
 
 
 def _load_model(voice: str) -> Iterator[tuple[Model, _Fingerprints]]:
-    """Load a voice, and yield its model with the fingerprints of its files.
+    """Load a voice. Yield its model and the fingerprints of its files.
 
     Raises:
         VoiceFileError: The voice can't be loaded.

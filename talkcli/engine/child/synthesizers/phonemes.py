@@ -125,7 +125,7 @@ def split_text(phonemizer: Phonemizer, text: str, *, ends_text: bool = True) -> 
 
 
 def _split_long_groups(phoneme_groups: Sequence[str]) -> Iterator[str]:
-    """Yield the groups of phonemes. Split those that are too long for one run of a model."""
+    """Yield groups of phonemes. Split groups that are too long for the model."""
     for group in phoneme_groups:
         for begin in range(0, len(group), _MAX_SECTION_PHONEMES):
             yield group[begin : begin + _MAX_SECTION_PHONEMES]
@@ -137,7 +137,7 @@ def _phoneme_groups(ipa: str) -> list[str]:
 
 
 def _locate_words(phonemizer: Phonemizer, clause: str, phoneme_groups: Sequence[str]) -> list[tuple[int, int, int]]:
-    """Return the index of each word's first phoneme, and the word's start and length in the clause.
+    """Locate the words of a clause. Return each word's phoneme index, start and length.
 
     The phonemes are counted across all groups.
     """
@@ -161,7 +161,7 @@ def _locate_words(phonemizer: Phonemizer, clause: str, phoneme_groups: Sequence[
 
 
 def _drop_repeated_positions(positions: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Drop word positions that repeat an earlier one or go back in the text."""
+    """Remove word positions that are repeated or out of order."""
     found: list[tuple[int, int]] = []
     for position in positions:
         if not found or position[0] > found[-1][0]:
@@ -170,7 +170,7 @@ def _drop_repeated_positions(positions: Sequence[tuple[int, int]]) -> list[tuple
 
 
 def _map_indexes(first: str, second: str, indexes: Sequence[int]) -> list[int]:
-    """Convert indexes in `first` to the corresponding indexes in `second`, a similar string."""
+    """Convert indexes in `first` to the matching indexes in `second`."""
     if len(first) * len(second) > _MAX_COMPARISONS:
         return [place * len(second) // len(first) for place in indexes]
     import difflib

@@ -172,7 +172,7 @@ class Piper:
         return model
 
     def _write_sound(self, parts: Iterator[SpokenPart], rate: int, run: ModelRun, sink: SampleSink) -> None:
-        """Write sound to the sink, while a thread synthesizes the following parts of the text."""
+        """Write sound to the sink. A thread synthesizes the next parts in the meantime."""
         write_bytes = int(_WRITE_S * rate) * SAMPLE_BYTES
         seconds = 0.0
         spoken_parts = BackgroundIterator(parts, _MAX_PARTS_AHEAD)
@@ -194,7 +194,7 @@ class Piper:
 def _speak_parts(
     model: Model, parts: Iterator[SpeechPart], speaker: int, settings: SpeechSettings, run: ModelRun
 ) -> Iterator[SpokenPart]:
-    """Synthesize the parts of a text, and yield small pieces of sound with their words.
+    """Synthesize the parts of a text. Yield small pieces of sound with their words.
 
     Raises:
         VoiceFileError: The model is faulty, or knows none of the phonemes with which the text begins.

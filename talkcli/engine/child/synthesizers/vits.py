@@ -105,7 +105,10 @@ class _Reader:
         self._fields_left = _MAX_FIELDS
 
     def fields(self, raw: Buffer) -> list[Field]:
-        """Parse a protobuf message. Return its fields, or raise NotSplit if it is invalid."""
+        """Parse a protobuf message. Return its fields.
+
+        Raise NotSplit if the message is invalid.
+        """
         found = []
         at, end = 0, len(raw)
         while at < end:
@@ -194,7 +197,7 @@ class _Graph:
         return names
 
     def fields_of(self, nodes: list[_Node]) -> list[Field]:
-        """Return the fields of a graph that has only these nodes and their weights.
+        """Return the fields of a smaller graph with only these nodes and their weights.
 
         Fields for its inputs and outputs have to be added.
         """
@@ -215,7 +218,7 @@ def _is_shared(reader: _Reader, field: Field) -> bool:
 
 
 def _checked_tensor_name(reader: _Reader, raw: Buffer) -> str:
-    """Return the name of a tensor, after checking that its data is in the same file.
+    """Return the name of a tensor. Its data must be in the same file.
 
     Raises:
         NotSplit: The data is in another file.
