@@ -49,7 +49,7 @@ def checked_sender_name(name: str | None) -> str | None:
 
 
 def take_repeatedly(connection: Connection, take: Callable[[], _T], deadline: float | None) -> Iterator[_T]:
-    """Call `take` in a loop and yield its results. Wait for the server when there are none.
+    """Yield the results of `take` without end. Wait for the server when there are none.
 
     An empty result is yielded if `deadline` has passed or the connection has ended. Nothing more is received after
     `deadline`, so that a loop over the results ends even if the server keeps sending events.

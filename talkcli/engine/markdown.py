@@ -159,7 +159,7 @@ class MarkdownReader:
         return self._read_mark(kind, token)
 
     def _begin_line(self, newline: str) -> str | None:
-        """Return the replacement for a newline and for the marks after it."""
+        """Return what replaces a newline and the marks that follow it."""
         text, at, before = self._text, self._at + len(newline), self._kind
         if not self._ended and (at == len(text) or _PARTIAL_LINE.match(text, at)):
             return None

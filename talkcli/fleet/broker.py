@@ -99,7 +99,7 @@ def from_environment(environment: Mapping[str, str], *, insecure: bool = False) 
         if value and not tls:
             raise UsageError(f"{name} needs TLS; change {URL} to an address that begins with mqtts://")
     if key and not cert:
-        raise UsageError(f"{KEY} is set, but {CERT} is not; set {CERT} to the file of the certificate")
+        raise UsageError(f"{KEY} is set, but {CERT} is not; set {CERT} to the certificate file")
     if password is not None and not (tls or insecure or is_local(host)):
         raise UsageError(
             f"the password would be sent to {printable(host)} in clear text; use {URL}=mqtts://…, or add "

@@ -19,7 +19,7 @@ ALL_ROBOTS = "all"
 ANY = "+"
 #: Stands for the robot's name in topics on which a client sends messages to itself. It isn't a valid robot name.
 MARKER = "_"
-#: A remote client's name at the server consists of this prefix and the client's user name.
+#: The server knows a remote client by this prefix and the client's user name.
 REMOTE_PREFIX = "mqtt:"
 #: Maximum length of a robot, group or user name.
 MAX_NAME_CHARS = MAX_SENDER_NAME_CHARS - len(REMOTE_PREFIX)

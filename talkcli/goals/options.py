@@ -158,7 +158,7 @@ IDS = Kind("list", (list, tuple), f"must be a list of at most {MAX_IDS} ids", "[
 
 @frozen
 class Setting:
-    """A setting of the server, which is the default value of a goal option."""
+    """A server setting: the default value of a goal option."""
 
     initial: Any
     #: value that means "none" and is shown as null

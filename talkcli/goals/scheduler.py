@@ -599,7 +599,7 @@ class Scheduler:
     # -- selecting and accepting goals
 
     def _select(self, selection: Cancel, result: Cancellation, waiting_ids: Collection[str | None]) -> list[Record]:
-        """Return the unfinished goals that a cancel selects. Add ended goals and unknown ids to `result`."""
+        """Return the unfinished goals to cancel. Add ended goals and unknown ids to `result`."""
         chosen = self.unfinished() if selection.selects_all else []
         for goal_id in dict.fromkeys(selection.ids or ()):
             record = self.find(goal_id)

@@ -123,7 +123,7 @@ class InheritedListener:
         return _identity(self.path) == self._identity
 
     def bind_again(self) -> socket.socket | None:
-        """Raise AddressInUse. Only systemd can create the socket file again.
+        """Raise AddressInUse, because only systemd can create the socket file again.
 
         If only the server were restarted, systemd would pass the old socket again.
         """

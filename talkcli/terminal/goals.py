@@ -343,7 +343,7 @@ def _muted_note(goal: Goal) -> list[str]:
 
 
 def _sender_command(sender: Sender) -> str:
-    """Return the command line of the sender's parent. If it is unknown, return its program."""
+    """Return the command line of the sender's parent process, or the sender's own if that is unknown."""
     return printable(sender.parent or sender.command or "a program", _SENDER_COMMAND_CHARS)
 
 

@@ -419,7 +419,7 @@ class GoalRunner:
             self._goal.error = exception
 
     def _handle_driver_finished(self, name: str | None, completed: bool, **_: object) -> None:
-        """End the goal after the driver has finished, unless it was stopped for a pause."""
+        """End the goal when the driver has finished. Do nothing if a pause stopped the driver."""
         goal = self._goal
         if goal is None or name != goal.id:  # the notification is for an earlier goal
             return

@@ -61,7 +61,7 @@ class RenderFailed(TalkError):
 
 
 class CannotWrite(RenderFailed):
-    """The file can't be written. An existing file was not changed."""
+    """The file can't be written. If it exists, it is unchanged."""
 
     def __init__(self, path: str, problem: str) -> None:
         super().__init__("cannot_write", f"{path} {problem}")

@@ -89,7 +89,7 @@ class FleetRequest:
         self._included, self._unfinished = set[str](), set[str]()
         self._outcomes: deque[Outcome] = deque()
         self._numbers = itertools.count(FIRST_SEQ)
-        #: the number of the message to the group, if the request goes to a group
+        #: the number of the message, if the request was sent to a group
         self._number = next(self._numbers)
         #: the error if the broker has rejected the message to the group
         self._refused: TalkError | None = None

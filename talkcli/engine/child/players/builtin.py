@@ -47,7 +47,7 @@ class BuiltInPlayer(Player):
         return self._taken
 
     def close(self) -> None:
-        """Accept no more samples."""
+        """Accept no more samples, and let the accepted ones play to the end."""
         self._closed = True
 
     def ended(self) -> bool:

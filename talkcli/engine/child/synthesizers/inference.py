@@ -35,7 +35,7 @@ os.environ.update(PACKAGE_VARIABLES)  # must be set before the packages are impo
 #: How many extra frames to decode before and after a part, because they affect its samples. The calculated value for
 #: Piper's largest decoder ("high") is 13.4. With 10 frames, the samples of a "medium" decoder differ by 1 in 400,000.
 CONTEXT_FRAMES = 14
-#: The maximum size of a model. Piper's models have 15 to 120 million bytes.
+#: The maximum size of a model. The size of Piper's models is 15 to 120 MB.
 _MAX_MODEL_BYTES = 1 << 28
 #: The maximum average number of frames per phoneme (including padding), and the maximum number of samples per frame. A
 #: model that exceeds them could make minutes of sound from one sentence and use gigabytes of memory. At its natural

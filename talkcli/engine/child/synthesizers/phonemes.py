@@ -73,7 +73,7 @@ class SpeechPart:
     phonemes: tuple[str, ...]
     #: for each word, the index of its first phoneme, its start in the text and its length. The indexes never decrease.
     words: tuple[tuple[int, int, int], ...]
-    #: whether this is the end of a sentence, after which the voice makes a pause
+    #: whether a pause follows because the sentence ends here
     ends_sentence: bool
 
 
