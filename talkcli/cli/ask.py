@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from talkcli.doctor import broker, examine
     from talkcli.goals.goal import Goal, JsonObject
 
-#: The number of characters of spoken text to show when a goal is paused.
+#: The maximum number of characters of spoken text to show when a goal is paused.
 _PAUSED_TEXT_CHARS = 40
 
 
@@ -123,7 +123,10 @@ def pause(options: CommonOptions) -> None:
         goal = client.pause()
     from talkcli.terminal.text import printable
 
-    heard = goal.spoken[-_PAUSED_TEXT_CHARS:] if goal and goal.spoken else ""
+    heard = " ".join((goal.spoken or "").split()) if goal else ""
+    if len(heard) > _PAUSED_TEXT_CHARS:
+        end = heard[-_PAUSED_TEXT_CHARS:]
+        heard = f"…{end.partition(' ')[2] or end}"
     place = f' after "{printable(heard)}"' if heard else ""
     words = f"goal {printable(goal.id)} is paused{place}" if goal else "speech is paused"
     _report_pause(options, goal, paused=True, message=f"{words}; continue with: talk resume")

@@ -227,7 +227,7 @@ class Scheduler:
         expired = expires_at <= now.monotonic
         recalled = self._find_room(say)
         if recalled is None and not (by or refused or expired):
-            refused = Reason.QUEUE_FULL, f"the queue is full ({len(self.pending)} goals); cancel some, or use --key"
+            refused = Reason.QUEUE_FULL, f"the queue is full ({len(self.pending)} goals); wait, or cancel some of them"
         if refused:
             record.reason, words = refused
             record.state, record.message, record.ended_at = State.REJECTED, f"not spoken: {words}", now.wall

@@ -40,7 +40,7 @@ def test_a_robot_drives_only_if_the_goal_was_spoken(scripted: Talk, scripted_she
         scripted_shell.stand_in(name, directory=scripted_shell.directory)
     assert scripted_shell.run(script, "length=0").returncode == 0
     assert (len(scripted_shell.calls("drive")), len(scripted_shell.calls("flash"))) == (1, 0)
-    assert "no loudspeaker" in scripted_shell.run(script, "fail=audio_device").stdout
+    assert "no sound" in scripted_shell.run(script, "fail=audio_device").stdout
     assert (len(scripted_shell.calls("drive")), len(scripted_shell.calls("flash"))) == (1, 1)
     assert "not spoken" in scripted_shell.run(script, "").stdout
     scripted.stop()

@@ -47,7 +47,7 @@ def requests_of(kind: type[Request]) -> st.SearchStrategy[Request]:
     limited = {
         "name": st.none() | st.text(min_size=1, max_size=MAX_SENDER_NAME_CHARS),
         "count": st.integers(1, MAX_LOG_GOALS),
-        "at": st.none() | st.integers(0),
+        "at": st.none() | st.integers(0, 10**18),
     }
     return st.builds(kind, **{**fields, **optional, **{name: limited[name] for name in fields if name in limited}})
 

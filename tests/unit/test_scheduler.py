@@ -33,7 +33,7 @@ MESSAGES = {
     "shutdown; a": "not spoken: the server is stopping",
     "a text=": "not spoken: the text is empty",
     "a fault=unknown_voice": "not spoken: it can't be had",
-    "room 1; a; b; c": "not spoken: the queue is full (1 goals); cancel some, or use --key",
+    "room 1; a; b; c": "not spoken: the queue is full (1 goals); wait, or cancel some of them",
     "a id=mine; b id=mine": "not spoken: the id mine was already used for another text",
     "a; b text=a throttle=60": "not spoken: the same text is being spoken",
     "a key=k; b key=k throttle=60": "not spoken: a goal with this key is being spoken",
