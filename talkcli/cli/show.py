@@ -42,7 +42,7 @@ _NO_BREAK_SPACE = "\0"
 
 
 class CommonOptions:
-    """The options common to all commands."""
+    """The options common to all commands, with the command's connection and start time."""
 
     socket: str | None = None
     robot: str | None = None
@@ -180,9 +180,9 @@ def reader_is_gone(error: OSError) -> bool:
 
 
 def handle_output_error(error: Exception) -> int | None:
-    """Handle a failed write to standard output. Return the exit code, or None for any other error.
+    """Discard further output after a failed write to standard output. Return the exit code.
 
-    Discard all further output. A full or broken disk is reported.
+    A full or broken disk is reported.
 
     Returns:
         The exit code, or None if the error doesn't concern standard output.

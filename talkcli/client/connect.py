@@ -144,7 +144,7 @@ def send_early(
 
 
 def yield_processor(attempt: ConnectionAttempt, timeout: float | None) -> None:
-    """Sleep briefly to leave the processor to the server.
+    """Sleep briefly after sending a goal, so that the server gets the processor.
 
     Return early if the goal will not be spoken. A client that only waits for the end of its goal calls this before its
     other imports. The server, the engine, the player and the sound server need the processor until the first sound.

@@ -259,7 +259,10 @@ def goal_in(reply: JsonObject, name: str = "goal") -> Goal | None:
 
 
 def greeting(version: str, pid: int, boot_id: str) -> JsonObject:
-    """Return the greeting, which is the first message that a server sends."""
+    """Return the greeting of a server. `boot_id` identifies this start of the server.
+
+    The greeting is the first message that a server sends.
+    """
     return {"talk": PROTOCOL, "version": version, "pid": pid, "boot": boot_id, "features": list(FEATURES)}
 
 

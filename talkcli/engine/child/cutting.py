@@ -209,7 +209,7 @@ class GrowingText:
 
 
 def _required_wait(text: str, start: int, stop: re.Match[str]) -> int:
-    """Return how long to wait for more text before ending a sentence at `stop`.
+    """Return the kind of wait for more text before a sentence ends at `stop`.
 
     The sentence begins at `start`, and `stop` is a match of `_SENTENCE_END`. The result is one of the constants
     such as `_SHORT_WAIT`.
@@ -234,7 +234,7 @@ def _required_wait(text: str, start: int, stop: re.Match[str]) -> int:
 
 
 def _required_abbreviation_wait(text: str, next_start: int, kind: str) -> int:
-    """Return how long to wait for more text before ending a sentence at an abbreviation.
+    """Return the kind of wait for more text before a sentence ends at an abbreviation.
 
     `next_start` is the offset of the text after it, and `kind` is the name of its group in `_ABBREVIATION`.
     """

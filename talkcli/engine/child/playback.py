@@ -498,7 +498,10 @@ class Playback:
     # -- steps
 
     def _send_all(self, feed: PlayerFeed) -> None:
-        """Send all samples to the player, except held-back silence. Play silence during a pause."""
+        """Send all samples to the player, except held-back silence. Wait as long as it takes.
+
+        Play silence during a pause.
+        """
         if feed.written == 0:
             feed.progress_at = time.monotonic()  # until now, the player had nothing to play
         while True:

@@ -120,7 +120,7 @@ def load_library() -> tuple[Any, str, int]:
 
 
 def _preload_library() -> tuple[str, bytes | None]:
-    """Load libespeak-ng. Return where it was found, and the directory of its data if it is known."""
+    """Load libespeak-ng. Return its origin ("system" or "espeakng-loader") and its data directory."""
     try:
         ctypes.CDLL(_LIBESPEAK)
         return "system", None

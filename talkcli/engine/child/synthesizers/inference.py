@@ -313,7 +313,7 @@ class Model:
 
 
 def load_libraries(model_path: str) -> None:
-    """Import numpy and onnxruntime.
+    """Import numpy and onnxruntime in advance.
 
     If this fails, the error names the model that needs them.
 
