@@ -182,7 +182,7 @@ COMMON_OPTIONS = (
     ),
     option("--insecure", FLAG, "Send the password to the broker without TLS."),
     option("--json", FLAG, "Print results and errors as JSON objects, one per line."),
-    option("-q, --quiet", FLAG, "Print errors only. The exit code tells how a goal ended."),
+    option("-q, --quiet", FLAG, "Print no ids, notes or results of goals."),
 )
 
 

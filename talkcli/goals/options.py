@@ -420,7 +420,7 @@ OPTIONS = (
         check=_check_own_id,
         form=f"1 to {MAX_ID_CHARS} characters from `A-Z a-z 0-9 . _ : / -`",
         default_words="set by the server",
-        help="Choose the goal's id. If a goal with this id was already sent, the sentence is not spoken again.",
+        help="Choose the goal's id. Until the server restarts, only one sentence is spoken with this id.",
     ),
     Option(
         "rate",
