@@ -97,7 +97,7 @@ def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, 
     name, equals, text = word.partition("=")
     option, value = flags[name]
     if option.kind is OUTPUT_FILE or (equals and not (option.takes_argument and name[:2] == "--")):
-        raise ValueError(f"click has to parse {word}")
+        raise ValueError(f"only click can parse the option {word}")
     takes_argument = option.takes_argument
     given[option.name] = read_value(option, text if equals else next(rest)) if takes_argument else value
 

@@ -43,7 +43,7 @@ class Finding:
 
 @frozen
 class Question:
-    """The question that the doctor answers, with both possible answers."""
+    """The two possible answers of the doctor: one if all checks passed, one if a check failed."""
 
     #: the human-readable answers
     yes: str
