@@ -507,8 +507,7 @@ class Scheduler:
     def failed(self, goal_id: str, reason: Reason, message: str, duration: float | None, now: Now) -> list[Effect]:
         """End the active goal as ABORTED, or as PREEMPTED if it was being stopped. Return the effects.
 
-        If the goal was being stopped, the failure has silenced it, so it ends PREEMPTED. It ends
-        ABORTED only with the reason `not_silent`.
+        A failure silences a goal that is being stopped. With the reason `not_silent`, the goal is always ABORTED.
         """
         record = self._require_active(goal_id)
         record.duration = duration

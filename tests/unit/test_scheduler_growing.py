@@ -57,7 +57,7 @@ changes nothing once the text is complete
 may come back if it chose the id
     a more id=x stall=2; left a; wait 1.9; append a text=b end; wait 9; completed a -> a SUCCEEDED
 may come back by sending the same goal
-    a more id=x stall=2; left a; wait 1.9; b more id=x text=a; wait 9 -> a ACTIVE; b is a
+    a more id=x stall=2; left a; wait 1.9; b more id=x text=a; wait 9; append a end; completed a -> a SUCCEEDED; b is a
 that chose the id breaks off the goal after the limit
     a more id=x stall=2; left a; wait 2; completed a -> a ABORTED broken_off
 that chose the id breaks off a waiting goal after the limit
