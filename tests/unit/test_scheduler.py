@@ -136,6 +136,7 @@ def test_a_word_is_heard_to_its_end_when_the_next_word_starts(text: str, words: 
     scheduler = Scheduler("4k7f", max_queue=1)
     scheduler.engine_ready(Now(0, 0))
     record, _ = scheduler.submit(Say(text), ARM, Now(0, 0))
+    assert record.snapshot().spoken_end == 0
     for number, word in enumerate(words):
         start = text.index(word)
         scheduler.word_heard(record.id, start, start + len(word), number * 0.5)
