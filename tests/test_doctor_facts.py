@@ -247,8 +247,8 @@ def test_installed_players_are_found_in_order_of_preference(tmp_path: Path) -> N
     env = env_with(tmp_path, **dict.fromkeys(("pacat", "aplay", "mine"), "exit 0"))
     assert sound.installed_players({"PATH": "/nowhere"}) == []
     assert sound.installed_players(env) == ["aplay", "pacat"]
-    assert sound.check_player(env, "mine -x", "mine -x", by_server=False).state == OK
-    assert sound.check_player(env, "missing", "missing", by_server=False).state != OK
+    assert sound.check_player(env, "mine -x", "mine -x", used_by_server=False).state == OK
+    assert sound.check_player(env, "missing", "missing", used_by_server=False).state != OK
 
 
 APLAY = "printf 'null\\n    Discard\\ndefault\\n    Default\\nplughw:CARD=Device,DEV=0\\n    USB\\n'"
@@ -394,7 +394,7 @@ def test_a_server_of_the_same_user_is_examined_with_its_environment(tmp_path: Pa
             assert session.runtime_owner == os.getuid()
             assert "an ssh session" in session.origins
             assert set(session.gids) == {os.getegid(), *os.getgroups()}
-            assert sound.names_a_player(process.pid, {})
+            assert sound.server_names_player(process.pid, {})
         finally:
             os.killpg(process.pid, 9)
 
@@ -406,5 +406,5 @@ def test_without_a_server_the_current_process_is_examined(tmp_path: Path, monkey
     assert f"{tmp_path}/gone, which does not exist" in sound.judge_session(session).message
     monkeypatch.delenv("XDG_RUNTIME_DIR")
     assert sound.find_session(None)[0].runtime_dir is None
-    assert sound.names_a_player(os.getpid(), {"TALK_PLAYER": "x"})
-    assert not sound.names_a_player(os.getpid(), {})
+    assert sound.server_names_player(os.getpid(), {"TALK_PLAYER": "x"})
+    assert not sound.server_names_player(os.getpid(), {})

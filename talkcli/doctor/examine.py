@@ -69,7 +69,7 @@ class LocalExamination:
         client, socket = server.connect(self._socket, self._interrupt)
         with client or contextlib.nullcontext():
             for each in self._run_checks(client, socket):
-                finding = sound.add_pactl_hint(each, self._env)
+                finding = sound.with_pactl_hint(each, self._env)
                 self._findings.append(finding)
                 yield finding
 
@@ -156,7 +156,7 @@ class LocalExamination:
         if self._engine.ready is not None and not by_server:
             used = self._engine.ready.player or used
         used = self._player or used
-        yield sound.check_player(env, self._player, used, by_server=by_server)
+        yield sound.check_player(env, self._player, used, used_by_server=by_server)
         if used in sound.DEVICE_LISTS and (used != "pulse" or sound_server.name is not None):
             yield sound.check_device(env, used, device)
         yield sound.check_cards(cards, sound_server, session)
@@ -179,7 +179,7 @@ class LocalExamination:
             used = self._setting("voice", "TALK_VOICE")
             options = voice.EngineOptions(player, voice=used, interrupt=self._interrupt)
             result = sentence.speak_by_engine(SENTENCE_TEXT, options, 0.0 if self._silent else 1.0, SENTENCE_LIMIT_S)
-        custom = sound.is_custom(player)
+        custom = sound.is_custom_command(player)
         step = sentence.find_playback_step(self._findings, custom_player=custom)
         if self._silent and self._server_pid is not None and self._session.server_pid is None:
             # The server belongs to another user, so its environment can't be read. If /proc is mounted with the option
@@ -198,7 +198,7 @@ class LocalExamination:
         player, first = self._player, None
         if is_silent(player):
             player = "null"  # don't write to the server's output file
-        elif player in PLAYERS and not sound.names_a_player(server_pid, self._env):
+        elif player in PLAYERS and not sound.server_names_player(server_pid, self._env):
             player, first = None, player  # the server chose this player automatically
         device, used, driver = map(self._setting, ("device", "voice", "driver"))
         return voice.EngineOptions(player, device, used, driver, first, self._env, self._interrupt)

@@ -9,7 +9,7 @@ import contextlib
 from typing import TYPE_CHECKING
 
 from talkcli.doctor.report import Finding, failure, ok
-from talkcli.doctor.sound import START_SOUND_SERVER, is_custom
+from talkcli.doctor.sound import START_SOUND_SERVER, is_custom_command
 from talkcli.doctor.voice import INSTALL_LIBRARY, SENTENCE_RATE_WPM, SENTENCE_TEXT, explain_failure, start_engine
 from talkcli.engine import protocol
 from talkcli.engine.parent.process import EngineFailed
@@ -213,7 +213,7 @@ def advise(
         return START_SOUND_SERVER
     if reason == Reason.ENGINE_FAILED and "libespeak-ng is missing" in message:
         return INSTALL_LIBRARY
-    if reason in _PLAYER_REASONS and isinstance(player, str) and is_custom(player):
+    if reason in _PLAYER_REASONS and isinstance(player, str) and is_custom_command(player):
         command = player.replace("{rate}", "22050").replace("{device}", str(device or "default"))
         return f"test the player with a second of silence: head -c 44100 /dev/zero | {command}"
     return ADVICE.get(reason or "", "another client ended the sentence: run talk doctor again")

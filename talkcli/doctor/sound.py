@@ -122,9 +122,9 @@ class SoundServer:
 
 
 def find_session(server_pid: int | None) -> tuple[UserSession, Mapping[str, str]]:
-    """Return the session and environment of the process that plays the sound.
+    """Return the session and environment of the `talk` server, or else of this process.
 
-    This is the server, or this process if there is no server or its environment can't be read.
+    This process counts if there is no server or its environment can't be read.
     """
     environment = None if server_pid is None else _read_environment(server_pid)
     if environment is None:
@@ -147,8 +147,8 @@ def find_session(server_pid: int | None) -> tuple[UserSession, Mapping[str, str]
     return session, environment
 
 
-def names_a_player(server_pid: int, env: Mapping[str, str]) -> bool:
-    """Return whether the server's command line or environment names a player.
+def server_names_player(server_pid: int, env: Mapping[str, str]) -> bool:
+    """Return whether the command line or environment of the `talk` server names a player.
 
     If it does, the server tries no other player.
     """
@@ -281,8 +281,8 @@ def run_program(program: str, *arguments: str, env: Mapping[str, str], limit: fl
     return ProgramOutput(next(lines, "it printed no message") if code else None, stdout)
 
 
-def is_custom(player: str | None) -> bool:
-    """Return whether a player is a command that the user wrote."""
+def is_custom_command(player: str | None) -> bool:
+    """Return whether a player is a custom command instead of a known player."""
     program = _program_of(player) if player and not is_silent(player) else None
     return program is not None and program.rpartition("/")[2] not in PLAYERS
 
@@ -331,8 +331,8 @@ DEVICE_LISTS: dict[str, tuple[str, Callable[[ProgramOutput], Iterable[str]], str
 }
 
 
-def add_pactl_hint(finding: Finding, env: Mapping[str, str]) -> Finding:
-    """Add an installation hint to a finding if its advice needs pactl. Return the finding."""
+def with_pactl_hint(finding: Finding, env: Mapping[str, str]) -> Finding:
+    """Return a finding with a hint for installing pactl, if its advice needs pactl."""
     if finding.next is None or "pactl " not in finding.next or on_path("pactl", env):
         return finding
     return replace(finding, next=f"{finding.next} (to install pactl: sudo apt-get install -y {PACKAGES['pacat']})")
@@ -345,7 +345,7 @@ def suspended_sinks(env: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def find_sound_server(env: Mapping[str, str], session: UserSession) -> SoundServer:
-    """Return facts about the sound server that the session's players connect to."""
+    """Run pactl or pw-cli to find the sound server of the session. Return facts about it."""
     pulse = run_program("pactl", "info", env=env)
     if pulse.error is None:
         fields = dict(re.findall(r"^\s*([\w ]+): (.*\S)", pulse.stdout, re.MULTILINE))
@@ -382,7 +382,7 @@ def _find_pulse_address(env: Mapping[str, str]) -> str | None:
 
 
 def check_levels(env: Mapping[str, str], server: SoundServer, cards: Sequence[str], *, in_use: bool) -> list[Finding]:
-    """Return findings about the volume of the sound server's output, or of the sound cards.
+    """Check the volume of the sound server's output, or of the sound cards. Return the findings.
 
     The sound cards are only checked if there is no sound server.
 
@@ -448,7 +448,7 @@ def judge_level(name: str, mixer_output: str, unmute_command: str, louder_comman
 
 
 def judge_session(session: UserSession) -> Finding:
-    """Check the user session. Return the finding."""
+    """Check the user and the directory in XDG_RUNTIME_DIR. Return the finding."""
     who = "" if session.server_pid is None else "the server runs as "
     who += f"user {session.user} (uid {session.uid})"
     who += "" if session.sudo_uid is None else f" through sudo by uid {session.sudo_uid}"
@@ -486,17 +486,17 @@ def _describe_player_setting(set_by_server: bool) -> str:
     return "set by the server" if set_by_server else "set by TALK_PLAYER"
 
 
-def check_player(env: Mapping[str, str], configured: str | None, used: str | None, *, by_server: bool) -> Finding:
+def check_player(env: Mapping[str, str], configured: str | None, used: str | None, *, used_by_server: bool) -> Finding:
     """Check whether the player is installed. Return the finding.
 
     Args:
         env: the environment of the player.
         configured: the player set by the server or by TALK_PLAYER, or None for the automatic choice.
         used: the player that is tried first, or None if no player is installed.
-        by_server: whether the server uses the player. Otherwise, the doctor's own engine does.
+        used_by_server: whether the server uses the player. Otherwise, the doctor's own engine does.
     """
     others = [each for each in installed_players(env) if each != used]
-    broken = warning if by_server else failure
+    broken = warning if used_by_server else failure
     if used is None:
         package = next(iter(PACKAGES.values()))
         return broken(
@@ -505,7 +505,7 @@ def check_player(env: Mapping[str, str], configured: str | None, used: str | Non
     if configured is None:
         how = " to play through the sound server" if used == "pulse" else ""
         return ok("player", f"{used} is used{how}" + (f"; other players: {', '.join(others)}" if others else ""))
-    words = f"{configured} ({_describe_player_setting(by_server)})"
+    words = f"{configured} ({_describe_player_setting(used_by_server)})"
     program = _program_of(configured)
     if program is None or not (program == "pulse" or on_path(program, env)):
         known = PACKAGES.get(configured)
@@ -588,7 +588,7 @@ def check_access(sound_server: SoundServer, session: UserSession, directory: str
 def judge_sound_server(
     server: SoundServer, cards: Sequence[str], session: UserSession, player: str | None = None
 ) -> Finding:
-    """Check the sound server. Return the finding.
+    """Check whether a sound server can be used. Return the finding.
 
     Without one, it is a warning if `player` needs a sound server.
     """

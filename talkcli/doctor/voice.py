@@ -136,7 +136,7 @@ def start_engine(options: EngineOptions, limit: float = math.inf, wav_fd: int | 
 
 
 def probe_engine(options: EngineOptions) -> EngineReport:
-    """Start and end an engine process. Return its report."""
+    """Start an engine process to test whether it works, and end it. Return its report."""
     ready = None
     try:
         with start_engine(options) as engine:
@@ -150,7 +150,7 @@ def probe_engine(options: EngineOptions) -> EngineReport:
 
 
 def explain_failure(error: EngineFailed) -> tuple[str, str]:
-    """Return the reason and the message of an engine's failure.
+    """Return the machine-readable reason and the message of an engine's failure.
 
     The reason is `engine_hung` if the engine stopped responding.
     """
@@ -160,7 +160,7 @@ def explain_failure(error: EngineFailed) -> tuple[str, str]:
 
 
 def judge_python() -> Finding:
-    """Create the finding that names the Python interpreter."""
+    """Return a finding that states the version and the path of Python."""
     return ok("python", f"Python {platform.python_version()} ({sys.executable})")
 
 

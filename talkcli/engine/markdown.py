@@ -159,7 +159,7 @@ class MarkdownReader:
         return self._read_mark(kind, token)
 
     def _begin_line(self, newline: str) -> str | None:
-        """Return what replaces a newline and the marks that follow it."""
+        """Begin a line. Return what replaces the newline and the marks that follow it."""
         text, at, before = self._text, self._at + len(newline), self._kind
         if not self._ended and (at == len(text) or _PARTIAL_LINE.match(text, at)):
             return None

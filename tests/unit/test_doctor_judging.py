@@ -190,7 +190,7 @@ def test_without_a_server_the_sentence_uses_the_environment_variables(monkeypatc
 
 def test_silent_mode_uses_the_servers_settings_and_players(monkeypatch: pytest.MonkeyPatch) -> None:
     def setting(configured: str | None, *, named: bool) -> EngineOptions:
-        monkeypatch.setattr(sound, "names_a_player", lambda *_: named)
+        monkeypatch.setattr(sound, "server_names_player", lambda *_: named)
         examination = LocalExamination(None, silent=True)
         examination._server = {"player": configured, "device": "usb", "voice": "de", "driver": "espeak"}
         examination._env = {}
@@ -430,7 +430,7 @@ def player(configured: str | None, used: str | None, *installed: str, by_server:
     """Return the finding about a player if only these programs are installed."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sound, "on_path", lambda program, _: program in installed)
-        return sound.check_player({}, configured, used, by_server=by_server)
+        return sound.check_player({}, configured, used, used_by_server=by_server)
 
 
 def test_a_sound_card_without_a_sound_server_is_ok() -> None:
@@ -519,11 +519,11 @@ def test_a_step_that_needs_pactl_names_its_package(tmp_path: Path) -> None:
     muted = failure("loudness", "muted", "pactl set-sink-mute @DEFAULT_SINK@ 0")
     without = {"PATH": str(tmp_path)}
     step = f"{muted.next} (to install pactl: sudo apt-get install -y pulseaudio-utils)"
-    assert sound.add_pactl_hint(muted, without).next == step
+    assert sound.with_pactl_hint(muted, without).next == step
     other = failure("socket", "no server", "talk serve")
-    assert sound.add_pactl_hint(other, without) == other
+    assert sound.with_pactl_hint(other, without) == other
     write(tmp_path / "pactl", "", 0o755)
-    assert sound.add_pactl_hint(muted, without) == muted
+    assert sound.with_pactl_hint(muted, without) == muted
 
 
 def test_a_missing_device_is_to_be_connected_or_passed_to_the_container() -> None:
@@ -604,5 +604,5 @@ def test_the_worst_of_several_outputs_counts(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_a_player_with_an_unknown_program_is_custom() -> None:
-    assert all(map(sound.is_custom, ("sleep 100", "/opt/bin/play -x", "false")))
-    assert not any(map(sound.is_custom, ("/usr/bin/aplay -q", "pacat", "null", "file:a.wav", "'", "", None)))
+    assert all(map(sound.is_custom_command, ("sleep 100", "/opt/bin/play -x", "false")))
+    assert not any(map(sound.is_custom_command, ("/usr/bin/aplay -q", "pacat", "null", "file:a.wav", "'", "", None)))

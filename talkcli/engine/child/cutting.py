@@ -132,7 +132,7 @@ class GrowingText:
         self.text, self._position, self.ended = self.text[: self._position], position, True
 
     def take_next_part(self, now: float, buffered_s: float) -> tuple[int, int] | None:
-        """Take the next part of the text. Return its offsets, if it can be cut now.
+        """Take the next part of the text. Return its offsets, or None if it can't be spoken yet.
 
         If the text is complete, the rest of it is one part. Blanks between parts are skipped.
 
@@ -150,7 +150,7 @@ class GrowingText:
         return start, end
 
     def next_part_at(self, now: float, buffered_s: float) -> float:
-        """Return the time at which the next part can be cut if no more text is added.
+        """Return the time at which the next part can be spoken if no more text is added.
 
         Return infinity if only more text can complete a part. `buffered_s` is the remaining sound of the player.
         """
@@ -163,7 +163,7 @@ class GrowingText:
         return float("inf")
 
     def _find_part_end(self, now: float, silent_at: float) -> int | None:
-        """Skip blanks. Return the end of the next part, if it can be cut now.
+        """Move the position past blanks. Return the end of the next part, if it can be spoken now.
 
         Args:
             now: the current time.
@@ -208,17 +208,17 @@ class GrowingText:
         return None
 
 
-def _required_wait(text: str, start: int, stop: re.Match[str]) -> int:
-    """Return the kind of wait for more text before a sentence ends at `stop`.
+def _required_wait(text: str, start: int, mark: re.Match[str]) -> int:
+    """Return how long to wait for more text before ending a sentence at a mark.
 
-    The sentence begins at `start`, and `stop` is a match of `_SENTENCE_END`. The result is one of the constants
+    The sentence begins at `start`, and `mark` is a match of `_SENTENCE_END`. The result is one of the constants
     such as `_SHORT_WAIT`.
     """
-    kind, end = stop.lastgroup, stop.end()
+    kind, end = mark.lastgroup, mark.end()
     sentence = text[start:end]
     if not re.search(r"\w", sentence[:_PART_CHARS]):
         return _NEVER
-    if "\n" in stop.group():
+    if "\n" in mark.group():
         return _NO_WAIT if kind == "line" else _LONG_WAIT
     if kind == "wide_stop":
         is_quoted = len(re.findall("[“「『（]", sentence)) > len(re.findall("[”」』）]", sentence))
@@ -226,7 +226,7 @@ def _required_wait(text: str, start: int, stop: re.Match[str]) -> int:
     following = len(text) - len(text[end:].lstrip(_LEAD))
     if text[following : following + 1].islower():
         return _NEVER
-    dot = stop.start()
+    dot = mark.start()
     abbreviation = _ABBREVIATION.search(text[max(start, dot - _ABBREVIATION_CHARS) : dot + 2])
     if abbreviation:
         return _required_abbreviation_wait(text, following, str(abbreviation.lastgroup))
@@ -234,7 +234,7 @@ def _required_wait(text: str, start: int, stop: re.Match[str]) -> int:
 
 
 def _required_abbreviation_wait(text: str, next_start: int, kind: str) -> int:
-    """Return the kind of wait for more text before a sentence ends at an abbreviation.
+    """Return how long to wait for more text before ending a sentence at an abbreviation.
 
     `next_start` is the offset of the text after it, and `kind` is the name of its group in `_ABBREVIATION`.
     """

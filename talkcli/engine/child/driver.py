@@ -130,6 +130,7 @@ def _start_engine(pyttsx3: Any, name: str, *, user_chosen: bool) -> Any:
 
 
 def _start_error_message(driver_name: str, error: Exception) -> str:
+    """Return the error message for a driver that could not be started."""
     return f'the driver "{driver_name}" could not be started: {type(error).__name__}: {error}'
 
 
@@ -144,7 +145,7 @@ def _available_drivers() -> list[str]:
 
 
 def _make_run_loop_step(driver_name: str) -> Callable[[], None]:
-    """Return a function that runs macOS's event loop once, if the driver needs it."""
+    """Return a function that runs macOS's event loop once. For other drivers, it does nothing."""
     if sys.platform != "darwin" or driver_name not in _RUN_LOOP_DRIVERS:
         return lambda: None
     from Foundation import NSDate, NSRunLoop  # type: ignore[import-not-found,unused-ignore]
@@ -215,7 +216,7 @@ class DriverProperties:
         self._voice = wanted
 
     def find_voice_id(self, wanted: str) -> str:
-        """Return the ID of the voice that best matches the user's input.
+        """Return the ID of the voice that best matches a name.
 
         Raises:
             CannotSpeak: there is no such voice.
@@ -275,7 +276,7 @@ class Driver:
         self._playback: Playback | None = None
 
     def iterate(self) -> Iterator[None]:
-        """Speak each stored text. Yield while there is no text."""
+        """Speak each text that was passed to `say`. Yield while there is none."""
         while True:
             if self._text is None:
                 self._proxy.setBusy(False)  # pyttsx3 sends no text while the driver is busy
@@ -348,7 +349,7 @@ class Driver:
         self._proxy.notify("finished-utterance", completed=runner.duration is not None)
 
     def _parts(self, text: str, playback: Playback) -> Iterator[tuple[str, bool]]:
-        """Yield each part of a text once it can be spoken. A flag marks the last part.
+        """Yield each part of a text once it can be spoken, and whether it is the last part.
 
         A text that doesn't grow is a single part. While text is missing, the playback continues.
         """

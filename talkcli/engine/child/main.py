@@ -76,9 +76,9 @@ def _die_with_parent() -> None:
 
 
 def _limit_core_dump() -> None:
-    """Prevent core dumps if a text crashes the library.
+    """Limit core dumps to one byte, in case a text crashes the speech library.
 
-    A dump takes longer than a restart, and wears out SD cards. The limit is one byte. With a limit of 0, the kernel
+    A dump takes longer than a restart, and wears out SD cards. With a limit of 0, the kernel
     would still pipe the core to a program that collects cores.
     """
     _, hard = resource.getrlimit(resource.RLIMIT_CORE)

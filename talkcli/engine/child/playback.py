@@ -181,10 +181,10 @@ class PlayerFeed:
         return taken
 
     def offer_silence(self, position: float, max_bytes: int | None = None) -> int:
-        """Offer silence to the player. Return the number of bytes accepted.
+        """Offer silence to the player before the next sample. Return the number of bytes accepted.
 
         Args:
-            position: position in the audio of the next sample, in seconds.
+            position: position of that sample in the audio, in seconds.
             max_bytes: maximum number of bytes to offer, or None for a whole piece.
         """
         taken = self.offer(memoryview(bytes(self.piece_bytes))[:max_bytes])
@@ -193,7 +193,7 @@ class PlayerFeed:
         return taken
 
     def update(self, now: float, *, all_written: bool) -> None:
-        """Adjust the clock to the player's progress.
+        """Adjust the word clock to the player's progress.
 
         Set `all_written` if nothing more will be written.
         """
@@ -353,7 +353,7 @@ class Playback:
         self._part_start, self._part_begin, self._part_follows = start, self._samples.end, not is_last
 
     def buffered(self) -> float:
-        """Return how many seconds of sound the player has left.
+        """Return how many seconds of sound the player still has to play.
 
         The result is 0 if the sound goes into a file.
         """
@@ -364,7 +364,7 @@ class Playback:
         return max(0.0, self._feed.buffered(time.monotonic()) + unsent - MIN_PLAYER_BUFFER_S)
 
     def await_text(self, until: float) -> None:
-        """Keep playing while waiting for more text, at most until `until`."""
+        """Keep playing while waiting for more text, but not after the time `until`."""
         self._text_was_missing = True
         self._keep_playing(until=until)
 
@@ -498,7 +498,7 @@ class Playback:
     # -- steps
 
     def _send_all(self, feed: PlayerFeed) -> None:
-        """Send all samples to the player, except held-back silence. Wait as long as it takes.
+        """Send all samples to the player except silence at the end. Wait until it has accepted them.
 
         Play silence during a pause.
         """
@@ -520,8 +520,8 @@ class Playback:
             if time.monotonic() >= due and not self._runner.hold_number and not self._offer_next(feed):
                 raise CannotSpeak(Reason.AUDIO_STALLED, f"{feed.player.name} accepted no sound for {limit:g} s")
 
-    def _await_samples(self, feed: PlayerFeed, interests: Sequence[Interest], until: float) -> None:
-        """Offer any unsent samples. Then wait once for the player, a descriptor or the time limit.
+    def _offer_and_wait(self, feed: PlayerFeed, interests: Sequence[Interest], until: float) -> None:
+        """Offer unsent samples. Then wait once for the player, a descriptor or the time limit.
 
         This is called while the next samples or more text are late, so the player doesn't count as stalled. If the
         sentence is paused, the method first plays silence until the pause ends.
@@ -560,7 +560,7 @@ class Playback:
     # -- samples
 
     def _skip_leading_zeros(self) -> bool:
-        """Skip silence before the first sound. Return whether playback can start.
+        """Skip silence before the first sound. Return False if playback must wait for more samples.
 
         Zeros before the first sound are skipped, so that the sentence is heard earlier. They are kept in a file. They
         are also kept after another sentence, because they are part of the silence between the two sentences.
@@ -572,7 +572,7 @@ class Playback:
         if all_zeros and self._seconds(zeros) < LEADING_ZEROS_LIMIT_S:
             return False
         self._start_known = True
-        if not all_zeros and self._players.takes_time and not self._players.handovers.follows:
+        if not all_zeros and self._players.takes_time and not self._players.handovers.goal_was_waiting:
             self._skipped = self._begin = self._sent = zeros
             self._clock.skip_until(self._seconds(zeros))
             self._clock.reset(self._seconds(zeros))
@@ -711,7 +711,7 @@ class Playback:
         This method may return early, for example after a pause.
         """
         if self._feed is not None:
-            self._with_player(lambda feed: self._await_samples(feed, interests, until))
+            self._with_player(lambda feed: self._offer_and_wait(feed, interests, until))
         elif self._runner.hold_number:
             self._wait_for_continue()
         else:
@@ -754,5 +754,6 @@ class Playback:
         self._raise_if_stopped()
 
     def _raise_if_stopped(self) -> None:
+        """Raise Stopped if the sentence was stopped."""
         if self._stopped:
             raise Stopped

@@ -238,7 +238,7 @@ class GoalRunner:
             until: the monotonic time.
         """
         self._send_voice_events()
-        watched, until = dict(interests), min(until, self._alive_due())
+        watched, until = dict(interests), min(until, self._next_heartbeat_at())
         if not self._channel.closed:
             watched[self._channel.descriptor] = select.POLLIN
         loader = self._synthesizer.loader if self._synthesizer else None
@@ -252,7 +252,7 @@ class GoalRunner:
                 self._stop_goal()
         self._send_voice_events()
         self._report_output()
-        if time.monotonic() >= self._alive_due():
+        if time.monotonic() >= self._next_heartbeat_at():
             self._channel.send(protocol.Alive(self._goal.id if self._goal else ""))
 
     def _execute(self, command: protocol.Command) -> None:
@@ -260,7 +260,7 @@ class GoalRunner:
         goal = self._goal
         if isinstance(command, protocol.LoadVoice | protocol.DropVoice):
             if self._synthesizer is not None:
-                self._synthesizer.carry_out(command)
+                self._synthesizer.load_or_unload(command)
         elif isinstance(command, protocol.GoalCommand):
             self._begin_goal(command)
         elif goal is None or isinstance(command, protocol.Configure) or goal.id != command.id:
@@ -277,9 +277,9 @@ class GoalRunner:
         elif not goal.stop_requested:
             self._pause(goal, command.number)
 
-    def _pause(self, goal: ActiveGoal, number: int) -> None:
+    def _pause(self, goal: ActiveGoal, hold_number: int) -> None:
         """Pause the current goal. A third-party driver is stopped, because it can't be paused."""
-        self.hold_number = number
+        self.hold_number = hold_number
         if self._step_run_loop is not None and goal.with_driver and not goal.interrupted:
             goal.interrupted = True
             self._engine.stop()
@@ -343,7 +343,7 @@ class GoalRunner:
     # -- one goal
 
     def _begin_goal(self, command: protocol.Speak) -> None:
-        """Make this the current goal, and tell the server that it has started."""
+        """Make a new goal the current one, and tell the server that it has started."""
         self._goal = ActiveGoal(command, time.monotonic())
         self.hold_number, self.duration, self.heard, self.gaps = 0, None, None, []
         self.players.begin(command)
@@ -419,7 +419,7 @@ class GoalRunner:
             self._goal.error = exception
 
     def _handle_driver_finished(self, name: str | None, completed: bool, **_: object) -> None:
-        """End the goal when the driver has finished. Do nothing if a pause stopped the driver."""
+        """End the goal when the driver has finished, unless a pause has stopped the driver."""
         goal = self._goal
         if goal is None or name != goal.id:  # the notification is for an earlier goal
             return
@@ -454,7 +454,7 @@ class GoalRunner:
         ended = protocol.Ended(goal.id, outcome, reason, message, self.duration, *gaps, player, heard)
         self._channel.send(ended)
 
-    def _alive_due(self) -> float:
+    def _next_heartbeat_at(self) -> float:
         """Return the time of the next heartbeat, or NEVER if none is needed.
 
         None is sent while the process is idle or a driver hangs.
@@ -466,7 +466,7 @@ class GoalRunner:
         return self._channel.sent_at + protocol.ALIVE_INTERVAL_S
 
     def _notice_overdue(self, goal: ActiveGoal) -> bool:
-        """Return whether a third-party driver takes too long. Log the first time for each goal.
+        """Return whether a third-party driver takes too long. Log this once for each goal.
 
         The process then sends no `Alive`, so that the server kills it. There may be no other way to stop the driver.
         """

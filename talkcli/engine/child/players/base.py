@@ -118,9 +118,9 @@ class Player(Protocol):
         """
 
     def ended(self) -> bool:
-        """Return whether the player was closed and has played everything.
+        """Return whether the player has played everything. Raise CannotSpeak if it has failed.
 
-        Raise CannotSpeak if it has failed.
+        The result is False before `close`.
 
         Raises:
             CannotSpeak: The player failed. This is also raised before `close`, even if no samples are offered.
@@ -134,7 +134,7 @@ class Player(Protocol):
         """
 
     def wake_at(self) -> float:
-        """Return the time of the next check, or NEVER if polling is enough.
+        """Return when to call the player again, or NEVER if polling its descriptors is enough.
 
         The result is a time of the monotonic clock.
         """

@@ -59,7 +59,7 @@ class BuiltInPlayer(Player):
         return ()
 
     def wake_at(self) -> float:
-        """Return 0, because this player is checked again at once."""
+        """Return 0, because this player can be called again at once."""
         return 0.0
 
     def kill(self) -> None:
@@ -226,9 +226,7 @@ def _convert_os_errors(reason: Reason, subject: str) -> Iterator[None]:
 
 
 def _open_regular_file(path: str) -> int:
-    """Open a file for reading and writing. Return its descriptor.
-
-    Create the file if it doesn't exist.
+    """Open a file for reading and writing, or create it. Return its descriptor.
 
     Raises:
         CannotSpeak: The path is empty, or isn't that of a regular file.

@@ -45,7 +45,7 @@ MAX_HANDOVER_S = 0.5
 
 
 class HandoverTimes:
-    """Measures the delays between sentences, and shortens silence to compensate.
+    """Measures the delays between sentences. The silence between them is shortened to compensate.
 
     A handover is the time between the last sample of one sentence and the first sample of the next. During a handover,
     the player drains and exits, the server gets the result, and the next sentence starts. This would lengthen the pause
@@ -65,7 +65,7 @@ class HandoverTimes:
         self._previous: tuple[str, float] | None = None
 
     @property
-    def follows(self) -> bool:
+    def goal_was_waiting(self) -> bool:
         """Whether another goal was waiting when the previous sentence ended."""
         return self._previous is not None
 
@@ -86,7 +86,7 @@ class HandoverTimes:
 
 
 class PlayerChooser:
-    """Opens the players of an engine process.
+    """Decides which players an engine process tries, and in which order.
 
     Args:
         configure: The settings of the engine process, such as the player and the device.
@@ -144,7 +144,7 @@ class PlayerChooser:
         self.handovers.next_waits, self.handovers.next_is_neural = command.next_waits, command.next_is_neural
 
     def update_output(self, player: Player) -> None:
-        """Record the output of a player.
+        """Record the device, the volume and the mute state of a player's output.
 
         The player's name is recorded too if it works and was chosen automatically.
 
@@ -173,7 +173,7 @@ class PlayerChooser:
         return milliseconds / 1000 if due else 0.0
 
     def find_first_player(self) -> str | None:
-        """Return the name of the player that would be tried first, if any.
+        """Return the name of the player that the next sentence would use, if any.
 
         Players that run in this process are opened and closed to test them.
         """

@@ -178,14 +178,14 @@ def _spawn(argv: tuple[str, ...], stdin: int, stderr: int, inherited: Sequence[i
             os.set_inheritable(each, False)
 
 
-def _attach_leash(leash: int, group: int) -> None:
-    """Make the kernel kill a process group when a pipe's other end is closed."""
+def _attach_leash(read_end: int, group: int) -> None:
+    """Make the kernel kill a process group when the write end of a pipe is closed."""
     if not hasattr(fcntl, "F_SETSIG"):
         return
     with contextlib.suppress(OSError):  # if a sandbox forbids this, the program still exits when its input is closed
-        fcntl.fcntl(leash, fcntl.F_SETOWN, -group)
-        fcntl.fcntl(leash, fcntl.F_SETSIG, signal.SIGKILL)
-        fcntl.fcntl(leash, fcntl.F_SETFL, fcntl.fcntl(leash, fcntl.F_GETFL) | os.O_ASYNC)
+        fcntl.fcntl(read_end, fcntl.F_SETOWN, -group)
+        fcntl.fcntl(read_end, fcntl.F_SETSIG, signal.SIGKILL)
+        fcntl.fcntl(read_end, fcntl.F_SETFL, fcntl.fcntl(read_end, fcntl.F_GETFL) | os.O_ASYNC)
 
 
 class ErrorOutput:
@@ -287,10 +287,7 @@ class ProgramPlayer(Player):
         self._process.stdin.close()
 
     def ended(self) -> bool:
-        """Return whether the program has played everything and exited.
-
-        If it has failed, raise CannotSpeak.
-        """
+        """Return whether the program has played everything. Raise CannotSpeak if it has failed."""
         status = self._process.poll()
         self._read_stderr()
         if status is None:

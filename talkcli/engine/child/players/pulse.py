@@ -158,10 +158,7 @@ class PulsePlayer(Player):
         self._run_and_check()
 
     def ended(self) -> bool:
-        """Return whether the server has played the whole stream.
-
-        If the stream has failed, raise CannotSpeak.
-        """
+        """Return whether the server has played the whole stream. Raise CannotSpeak if it has failed."""
         self._run_and_check()
         return self._drained
 
@@ -225,7 +222,7 @@ class PulsePlayer(Player):
             pass
 
     def _advance_stream(self) -> bool:
-        """Check the connection, and advance the stream. Return whether to run libpulse again."""
+        """Open, update or drain the stream if it is time. Return whether to run libpulse again."""
         if self._error is not None or self._drained:
             return False
         state = self._lib.context_get_state(self._context)
@@ -270,7 +267,7 @@ class PulsePlayer(Player):
         return True
 
     def _follow_sink(self) -> bool:
-        """Handle a changed or suspended sink. Return whether requests were sent."""
+        """Check whether the sink was changed or suspended. Return whether requests were sent."""
         index = int(self._lib.stream_get_device_index(self._stream))
         changed = index != self._sink_index
         if changed:
@@ -334,10 +331,7 @@ class PulsePlayer(Player):
         return self._pending_levels > 0 or time.monotonic() < self._volume_settled_at
 
     def _record_mute(self) -> None:
-        """Mark the sentence as muted if the output is silent.
-
-        If the sentence must be audible, it fails.
-        """
+        """If the output is muted, record this, and fail the sentence if it must be audible."""
         levels = [each for each in (self._sink_level, self._stream_level) if each is not None]
         if self._drained or self._is_volume_pending() or not any(each.muted or each.volume == 0 for each in levels):
             return
@@ -346,7 +340,7 @@ class PulsePlayer(Player):
             self._error = CannotSpeak(Reason.MUTED, f"the output {self.device} is muted", final=True)
 
     def _restart_clock(self) -> None:
-        """Forget the reported playback time, and request it again."""
+        """Forget the reported playback time, and schedule a new request."""
         self._clock_report, self._time_request_at = None, 0.0
 
     def _record_failure(self) -> None:
@@ -373,7 +367,7 @@ class PulsePlayer(Player):
     # -- callbacks of libpulse
 
     def _on_started(self, *_: Any) -> None:
-        """Restart the clock, because the server has started to play."""
+        """Record that the server has started to play, and restart the clock."""
         self.proven, self._dry_at = True, None
         self._restart_clock()
 

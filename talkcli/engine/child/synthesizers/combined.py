@@ -81,7 +81,7 @@ class CombinedSynthesizer:
         """The model loader, or None if no neural voice has been requested yet."""
         return self._neural.loader if self._neural else None
 
-    def carry_out(self, command: LoadVoice | DropVoice) -> None:
+    def load_or_unload(self, command: LoadVoice | DropVoice) -> None:
         """Start loading a neural voice in the background, or unload one."""
         loader = self._get_piper().loader
         if isinstance(command, protocol.DropVoice):

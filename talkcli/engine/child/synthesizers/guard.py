@@ -110,9 +110,9 @@ def _unsafe_characters(language: str) -> re.Pattern[str]:
 
 
 def _split_number(number: str, min_digits: int, max_digits: int) -> str:
-    """Split a long number by making one digit a superscript.
+    """Split a number of `min_digits` to `max_digits` digits by making one digit a superscript.
 
-    The number has `min_digits` to `max_digits` digits.
+    Return any other number unchanged.
     """
     if not min_digits <= sum(map(str.isdigit, number)) <= max_digits:
         return number

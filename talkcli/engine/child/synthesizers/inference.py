@@ -313,9 +313,7 @@ class Model:
 
 
 def load_libraries(model_path: str) -> None:
-    """Import numpy and onnxruntime in advance.
-
-    If this fails, the error names the model that needs them.
+    """Import numpy and onnxruntime. If this fails, the error names the model that needs them.
 
     This takes 0.25 s, and blocks all other threads for a tenth of that time.
 

@@ -107,7 +107,7 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
         self._room.release()
 
     def _put(self, item: _T | None, error: BaseException | None = None) -> None:
-        """Add an item or the end mark, and make the descriptor readable."""
+        """Add an item, an error or the end mark, and make the descriptor readable."""
         self._made.append((item, error))
         with self._lock:
             if not self._closed:
@@ -154,7 +154,7 @@ class ModelLoader:
         self.errors.pop(voice, None)
 
     def start(self, voice: str) -> None:
-        """Queue a voice for loading. If it is already loaded, report this at once.
+        """Queue a voice for loading, or add an event if it is already loaded.
 
         When the load begins, any earlier error of the voice is forgotten.
         """
@@ -223,10 +223,10 @@ class ModelLoader:
         self._start_next_load()
 
     def _measure_memory(self, voice: str, min_growth: float = -math.inf) -> None:
-        """Free unused memory, and record how much memory all voices use.
+        """Measure the memory used by all voices. Add an event if it has grown enough.
 
-        `voice` was just loaded or used. It is empty if a voice was unloaded. If the growth since the last event is
-        below `min_growth` bytes, record nothing unless a voice was unloaded.
+        `voice` was just loaded or used. It is empty if a voice was unloaded. In that case, or if the memory has grown
+        by at least `min_growth` bytes since the last event, free unused memory and add an event.
         """
         self._unmeasured = None
         before, now = self._initial_bytes, _read_private_bytes()

@@ -218,7 +218,7 @@ def _is_shared(reader: _Reader, field: Field) -> bool:
 
 
 def _checked_tensor_name(reader: _Reader, raw: Buffer) -> str:
-    """Return the name of a tensor. Its data must be in the same file.
+    """Return the name of a tensor. Raise NotSplit if its data is in another file.
 
     Raises:
         NotSplit: The data is in another file.
