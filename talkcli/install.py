@@ -45,16 +45,16 @@ def command(*packages: str, reinstall: bool = False) -> str:
 
 
 def neural_command(*more: str, reinstall: bool = False) -> str:
-    """Return the shell command that installs the packages for neural voices.
+    """Return the shell command that installs the packages for neural voices, or why there is none.
 
-    On a 32-bit system, return an explanation instead, because neural voices need a 64-bit system.
+    On a 32-bit system, there is none.
     """
     if not IS_64_BIT:
         return "neural voices need a 64-bit system; use an espeak voice, such as en"
     return command(*NEURAL_PACKAGES, *more, reinstall=reinstall)
 
 
-def espeak_library() -> str:
+def espeak_command() -> str:
     """Return the shell command or commands that install libespeak-ng."""
     package = "sudo apt-get install -y libespeak-ng1"
     return f"{package}, or {command('espeakng-loader')}" if IS_64_BIT else package

@@ -56,7 +56,7 @@ def client_sockets(named: str | None) -> list[str]:
     return list(dict.fromkeys([*places, SYSTEM_SOCKET]))
 
 
-def describe_place(path: str, error: OSError) -> str:
+def connect_failure(path: str, error: OSError) -> str:
     """Return the reason why connecting to a socket path failed."""
     try:
         mode = os.stat(path).st_mode

@@ -63,9 +63,7 @@ def ancestors(pid: int) -> Iterator[int]:
 
 
 def parent_command_line(pid: int) -> str | None:
-    """Return the start of the parent's command line, if it is known.
-
-    Wrappers such as sudo are skipped.
+    """Return the start of the command line of a process's parent, skipping wrappers such as sudo.
 
     Wrappers are programs that run another program. For `timeout 5 talk say …`, the result is the script that called
     `timeout`.

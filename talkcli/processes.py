@@ -39,7 +39,7 @@ def close(*descriptors: int) -> None:
 
 
 def is_held(pipe: int, seconds: float = 0.0) -> bool:
-    """Return whether the other end of a pipe stays open for `seconds`."""
+    """Wait up to `seconds` for the other end of a pipe to close. Return whether it is still open."""
     # Don't use `wait_ready` here. A player may be killed while the interpreter exits, when modules can't be imported.
     poll = select.poll()
     poll.register(pipe, 0)  # Linux reports that the other end was closed even if no events are requested

@@ -265,14 +265,14 @@ async def test_the_client_with_the_largest_backlog_is_dropped_at_the_limit(monke
         taken = 1_000_000 - pairs[0].stream.unsent_bytes
         monkeypatch.setattr(stream, "MAX_TOTAL_OUTPUT_BYTES", streams.unread_bytes + 3_000)
         pairs[0].stream.write(b"x" * 1_000)
-        pairs[1].stream.count_held(1_500)  # like a list that the client doesn't read
-        pairs[1].stream.count_held(500)
+        pairs[1].stream.adjust_held_bytes(1_500)  # like a list that the client doesn't read
+        pairs[1].stream.adjust_held_bytes(500)
         assert not any(pair.stream.closing for pair in pairs)
         pairs[2].stream.write(b"x" * 1_000)
         await until_lost(pairs[1])
         assert [pair.stream.closing for pair in pairs] == [False, True, False]
         assert streams.unread_bytes == 2 * (1_000_000 - taken) + 2_000
-        pairs[1].stream.count_held(-2_000)  # must have no effect after the stream has ended
+        pairs[1].stream.adjust_held_bytes(-2_000)  # must have no effect after the stream has ended
         assert len(pairs[0].receive()) == taken
         await turn()
         assert streams.unread_bytes == pairs[0].stream.unsent_bytes + pairs[2].stream.unsent_bytes

@@ -249,7 +249,7 @@ def connect(
 
 def _server_may_start(attempt: ConnectionAttempt) -> bool:
     """Return whether a server may still be starting at one of the tried paths."""
-    found = {paths.describe_place(path, error) for path, error in attempt.failures if isinstance(error, OSError)}
+    found = {paths.connect_failure(path, error) for path, error in attempt.failures if isinstance(error, OSError)}
     return not found.isdisjoint({paths.PLACE_ABSENT, paths.PLACE_STALE})
 
 
@@ -306,7 +306,7 @@ def unreachable_error(attempt: ConnectionAttempt, named_path: str | None) -> Tal
     for path, error in attempt.failures:
         words = str(error)
         if isinstance(error, OSError):
-            words = found = paths.describe_place(path, error)
+            words = found = paths.connect_failure(path, error)
             if found == paths.PLACE_DIRECTORY:
                 words += f"; use {_socket_inside(path)}"
             elif found == paths.PLACE_FORBIDDEN:
@@ -332,7 +332,7 @@ def _advice_for_named_socket(named_path: str, found: str, access_advice: str) ->
 
     Args:
         named_path: the path as the user named it.
-        found: what is there, as described by `paths.describe_place`.
+        found: what is there, as described by `paths.connect_failure`.
         access_advice: how to get access, or an empty text if this user isn't refused.
     """
     import shlex  # rarely needed, and slow to import

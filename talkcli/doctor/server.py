@@ -126,7 +126,7 @@ def _probe_path(path: str, trusted_paths: Container[str | None]) -> SocketPlace:
             uid = file_owner(os.path.dirname(path)) if uid is None else uid
             if isinstance(error, BlockingIOError):  # the server's backlog is full
                 return SocketPlace(path, PLACE_LISTENING, uid)
-            state = paths.describe_place(path, error)
+            state = paths.connect_failure(path, error)
             closed = state == PLACE_FORBIDDEN and paths.closed_directory(path)
             return SocketPlace(path, PLACE_CLOSED if closed else state, uid)
         pid, uid = peers.credentials(probe)

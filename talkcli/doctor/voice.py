@@ -37,7 +37,7 @@ SENTENCE_TEXT, SENTENCE_RATE_WPM = "If you hear this, talk works.", 200
 #: The states in which a server's engine works.
 WORKING_STATES = ("ready", "starting")
 #: The commands to show if a package is missing.
-INSTALL_LIBRARY = install.espeak_library()
+INSTALL_LIBRARY = install.espeak_command()
 _INSTALL_PYTTSX3 = install.command("pyttsx3")
 _INSTALL_NEURAL = install.neural_command()
 

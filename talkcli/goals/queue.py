@@ -65,7 +65,7 @@ class Queue:
         return next((each for each in self if each.say.text == text), None)
 
     def goals_up_to(self, priority: int, *, only_preempting: bool) -> list[Record]:
-        """Return all goals, or only the preempting ones, with this priority or a lower one."""
+        """Return the goals with this priority or a lower one, or only those that may interrupt others."""
         goals = self._preempting if only_preempting else self._goals
         return list(map(_record_of, goals[bisect_left(goals, (-priority,)) :]))
 
@@ -108,7 +108,7 @@ class Queue:
         return list(map(_record_of, self._expiries[: bisect_left(self._expiries, (now, inf))]))
 
     def _entries(self, record: Record) -> Iterator[tuple[list[_Entry], _Entry]]:
-        """Yield each list that contains the goal, with the goal's entry."""
+        """Yield each sorted list in which a goal belongs, and the goal's entry for that list."""
         entry = -record.say.priority, record.position, record
         yield self._goals, entry
         yield self._displaceable, (-record.say.priority, record.number, record)

@@ -169,13 +169,13 @@ class Scheduler:
         attaches = say.id is not None and self.find(say.id) is not None
         return attaches or self._find_room(say) is not None
 
-    def lacks_room(self, say: Say, now: Now, refusal: Refusal | None = None) -> bool:
+    def only_lacks_room(self, say: Say, now: Now, server_refusal: Refusal | None = None) -> bool:
         """Return whether a goal would be rejected only because the queue is full.
 
-        `refusal` is the server's own reason to reject the goal, as in `submit`.
+        `server_refusal` is the server's own reason to reject the goal, as in `submit`.
         """
         canceled = self._early_cancels.find(say.id, now.monotonic)
-        return not (canceled or self.has_room(say)) and self._find_refusal(say, refusal, None) is None
+        return not (canceled or self.has_room(say)) and self._find_refusal(say, server_refusal, None) is None
 
     def wanted_voice(self, record: Record) -> str:
         """Return the voice that a goal asks for, or the server's default voice.
@@ -191,8 +191,8 @@ class Scheduler:
         say: Say,
         sender: Sender,
         now: Now,
-        refusal: Refusal | None = None,
-        canceler: By | None = None,
+        server_refusal: Refusal | None = None,
+        canceled_by: By | None = None,
         waited_s: float = 0.0,
     ) -> tuple[Record, list[Effect]]:
         """Add a goal to the queue, or reject it. Return its record and the effects.
@@ -203,8 +203,8 @@ class Scheduler:
             say: the goal.
             sender: the program that sent the goal.
             now: the current time.
-            refusal: the server's own reason to reject the goal, or None.
-            canceler: the client that cancelled the goal while it waited for room. The goal is accepted and recalled.
+            server_refusal: the server's own reason to reject the goal, or None.
+            canceled_by: the client that cancelled the goal while it waited for room. The goal is accepted and recalled.
             waited_s: how long the goal waited for room, which counts towards its time to live.
 
         Returns:
@@ -222,8 +222,10 @@ class Scheduler:
         number, asked = self._count, say if ttl == say.ttl else replace(say, ttl=ttl)
         record = Record(f"{self.boot}-{number}", number, asked, sender, now.wall, self._may_preempt(say), expires_at)
         record.first_chars = len(say.text)
-        by = canceler or self._early_cancels.find(say.id, now.monotonic)
-        refused = self._find_refusal(say, refusal, first) or (None if canceler else self._find_repeat(say, record, now))
+        by = canceled_by or self._early_cancels.find(say.id, now.monotonic)
+        refused = self._find_refusal(say, server_refusal, first) or (
+            None if canceled_by else self._find_repeat(say, record, now)
+        )
         expired = expires_at <= now.monotonic
         recalled = self._find_room(say)
         if recalled is None and not (by or refused or expired):
@@ -237,7 +239,7 @@ class Scheduler:
         self._by_id[record.id] = record
         effects: list[Effect] = [StateChange(record, State.PENDING)]
         if by:
-            words = f"the goal was cancelled before it {'started' if canceler else 'arrived'}"
+            words = f"the goal was cancelled before it {'started' if canceled_by else 'arrived'}"
             return record, effects + self._end_unqueued(record, Reason.CANCELED, words, by, now)
         if expired:
             words = _expiry_message(record)
@@ -249,10 +251,10 @@ class Scheduler:
     def cancel(
         self, selection: Cancel, sender: Sender | None, now: Now, waiting_ids: Collection[str | None] = ()
     ) -> Cancellation:
-        """Cancel the selected goals, and remember unknown ids. Return the result.
+        """Cancel goals, and unknown ones if they arrive soon. Return the affected goals and the effects.
 
-        Pending goals end at once. The active goal ends when the engine is silent. If a goal with a remembered id
-        arrives soon, it is cancelled, too.
+        Pending goals end at once. The active goal ends when the engine is silent. Unknown ids are
+        remembered, and a goal with such an id is cancelled if it arrives soon.
 
         Args:
             selection: the goals to cancel.
@@ -319,7 +321,7 @@ class Scheduler:
         return [EngineOrder(record, Order.APPEND)] if record.state is State.ACTIVE and (added or addition.end) else []
 
     def producer_left(self, record: Record, now: Now) -> list[Effect]:
-        """End a goal whose sender left, or wait for another connection. Return the effects.
+        """End an incomplete goal whose client left, unless another may continue it. Return the effects.
 
         Another connection can continue the text only if the sender chose the goal's id.
         """
@@ -329,7 +331,7 @@ class Scheduler:
         return []
 
     def break_off(self, record: Record, now: Now, *, at_once: bool = False) -> list[Effect]:
-        """End a goal whose text will stay incomplete. Return the effects.
+        """End an incomplete goal, at once or after speaking the text so far. Return the effects.
 
         A goal that hasn't started always ends at once.
         """
@@ -407,9 +409,9 @@ class Scheduler:
         return self._start_next(now) + self._order_next_voice(now)
 
     def engine_unavailable(self, now: Now) -> list[Effect]:
-        """Record that no engine can be started, and start the next goal. Return the effects.
+        """Record that no engine can be started, and let goals fail from now on. Return the effects.
 
-        From now on, goals fail instead of waiting for an engine.
+        The next goal starts and fails at once.
         """
         self.has_engine, self._loads_voices = True, False
         return self._start_next(now)
@@ -425,7 +427,7 @@ class Scheduler:
         return effects + self.failed(record.id, Reason.ENGINE_FAILED, message, None, now) if record else effects
 
     def word_heard(self, goal_id: str, start: int, end: int, seconds: float) -> None:
-        """Record that a word of the active goal has started.
+        """Record that a word of the active goal has started, and its position in the audio.
 
         All words before it were heard to their end.
 
@@ -452,15 +454,15 @@ class Scheduler:
         record = self._require_active(goal_id)
         record.heard = max(record.heard, seconds)
 
-    def text_missing(self, goal_id: str, length: int, now: Now, *, missing: bool) -> None:
+    def text_missing(self, goal_id: str, received_chars: int, now: Now, *, missing: bool) -> None:
         """Record whether the active goal is silent while it waits for text.
 
-        `length` is the number of characters that the engine has received.
+        `received_chars` is the number of characters that the engine has received.
         """
         record = self._require_active(goal_id)
         record.waits = missing
         if missing:
-            record.spoken_end, record.passed_chars = record.begun_end, length
+            record.spoken_end, record.passed_chars = record.begun_end, received_chars
         self._reset_stall_limit(record, now)
 
     def voice_chosen(self, goal_id: str, voice: str, now: Now) -> list[Effect]:
@@ -478,9 +480,9 @@ class Scheduler:
     def completed(
         self, goal_id: str, duration: float | None, now: Now, gaps: int = 0, gap_seconds: float = 0
     ) -> list[Effect]:
-        """End the active goal after it was played to the end, usually as SUCCEEDED. Return the effects.
+        """End the active goal as SUCCEEDED, or as ABORTED if its text broke off. Return the effects.
 
-        It ends as ABORTED if its text broke off.
+        Its audio was played to the end.
 
         Args:
             goal_id: the id of the goal.
@@ -532,7 +534,7 @@ class Scheduler:
         why = f"interrupted by goal {goal}" if goal else why
         return self._end(record, State.PREEMPTED, record.reason, f"Talk preempted: {why}", record.by, now)
 
-    def voice_load_ended(self, voice: str, error: str | None, now: Now, *, has_libraries: bool) -> list[Effect]:
+    def voice_load_ended(self, voice: str, error: str | None, now: Now, *, imported_libraries: bool) -> list[Effect]:
         """Record that a voice was loaded or failed to load. Return the effects.
 
         The effects start the next goal if it waited for the voice.
@@ -541,21 +543,21 @@ class Scheduler:
             voice: the id of the voice.
             error: the human-readable error, or None if the voice was loaded.
             now: the current time.
-            has_libraries: whether the engine process has imported the libraries for neural voices.
+            imported_libraries: whether the engine process has imported the libraries for neural voices.
         """
-        self.voices.has_libraries = self.voices.has_libraries or has_libraries
+        self.voices.has_libraries = self.voices.has_libraries or imported_libraries
         self.voices.load_ended(voice, error, now.monotonic)
         return self._order_voice_drops() + self.tick(now)
 
-    def voices_measured(self, voice: str, memory_bytes: int, now: Now) -> list[Effect]:
+    def voices_measured(self, voice: str, total_bytes: int, now: Now) -> list[Effect]:
         """Record how much memory all neural voices use. Return orders to drop or load voices.
 
         Args:
             voice: the voice that was just loaded or has just spoken, or "" if a voice was dropped.
-            memory_bytes: the memory of all voices together.
+            total_bytes: the memory of all voices together.
             now: the current time.
         """
-        self.voices.measured(voice, memory_bytes)
+        self.voices.measured(voice, total_bytes)
         return self._order_voice_drops() + self._order_next_voice(now)
 
     def voice_unloaded(self, voice: str, now: Now) -> list[Effect]:
@@ -622,14 +624,12 @@ class Scheduler:
         # Cancel the active goal last. Otherwise, another selected goal could start before it is recalled.
         return sorted(unique, key=lambda each: (each is self.active, each.number))
 
-    def _find_refusal(self, say: Say, refusal: Refusal | None, conflicting: Record | None) -> Refusal | None:
-        """Return the reason why a goal must be rejected, if there is one.
-
-        This method doesn't check whether the queue has room.
+    def _find_refusal(self, say: Say, server_refusal: Refusal | None, conflicting: Record | None) -> Refusal | None:
+        """Return the reason to reject a goal, if there is one other than a full queue.
 
         Args:
             say: the goal.
-            refusal: the server's own reason to reject the goal, or None.
+            server_refusal: the server's own reason to reject the goal, or None.
             conflicting: an earlier goal with the same id and another text, or None.
         """
         if self.closing:
@@ -639,10 +639,10 @@ class Scheduler:
         if conflicting is not None:
             return Reason.ID_CONFLICT, f"the id {say.id} was already used for another text"
         limit = self.max_text * options.GROWTH_FACTOR if say.more else self.max_text
-        return options.bad_text(say.text, limit) or refusal
+        return options.bad_text(say.text, limit) or server_refusal
 
     def _find_repeat(self, say: Say, record: Record, now: Now) -> Refusal | None:
-        """Return a refusal if a goal repeats another one too soon. Store the other goal's id in `record.by`."""
+        """Return a refusal if a goal repeats another too soon, and store that goal's id in `record.by`."""
         if say.throttle is None:
             return None
         active = self.active
@@ -668,9 +668,9 @@ class Scheduler:
         return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)
 
     def _find_room(self, say: Say) -> list[tuple[Record, Reason]] | None:
-        """Find room in the queue for a new goal. Return the goals to remove, with reasons.
+        """Return the goals that a new goal removes from the queue, or None if there is no room for it.
 
-        Return None if there is no room.
+        Each comes with the reason for its removal.
         """
         replaced = self.pending.with_key(say.key)
         preempted: list[Record] = []
@@ -706,10 +706,7 @@ class Scheduler:
     # -- voices
 
     def _request_voice(self, voice: str, now: Now) -> None:
-        """Plan to load a goal's voice if it is neural.
-
-        Do nothing while no engine process is running.
-        """
+        """Plan to load a voice if it is neural and an engine process is running."""
         if self._loads_voices and options.is_neural(model := options.without_speaker(voice)):
             self.voices.request(model, now.monotonic)
 

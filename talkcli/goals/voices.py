@@ -237,15 +237,15 @@ class VoiceScheduler:
         else:
             found.fail(error, now)
 
-    def measured(self, voice: str, memory_bytes: int) -> None:
-        """Record how much memory the voices use, and attribute the change to one voice.
+    def measured(self, voice: str, total_bytes: int) -> None:
+        """Record how much memory all voices use, and attribute the change to one of them.
 
         Args:
             voice: the voice that was just loaded or has just spoken, or "" if a voice was dropped.
-            memory_bytes: the memory of all voices together.
+            total_bytes: the memory of all voices together.
         """
-        found, growth = self._voices.get(voice), memory_bytes - self._reported_bytes
-        self._reported_bytes = self._used_bytes = memory_bytes
+        found, growth = self._voices.get(voice), total_bytes - self._reported_bytes
+        self._reported_bytes = self._used_bytes = total_bytes
         if found:
             found.size_bytes = max(0, found.size_bytes + growth if found.state is VoiceState.LOADED else growth)
             self._measured_bytes[voice] = found.size_bytes

@@ -157,10 +157,7 @@ _json_functions: dict[str, Callable[[Any], Any]] = {}
 
 
 def _json_function(name: str) -> Callable[[Any], Any]:
-    """Return one of the functions that decode, encode and escape JSON.
-
-    The first call creates all three.
-    """
+    """Return the JSON function `decode`, `encode` or `escape`. The first call creates all three."""
     if not _json_functions:
         import json
 

@@ -116,10 +116,7 @@ class PendingRequest:
                 timer.cancel()
 
     def resume(self, in_time: bool = True) -> None:
-        """Continue the request if it is waiting.
-
-        Its call of `wait` returns `in_time`.
-        """
+        """Continue the request if it is waiting. Its call of `wait` returns `in_time`."""
         if self._leave():
             self._step(in_time)
 
@@ -164,9 +161,9 @@ class PendingRequest:
             self.connection.send(reply)
 
     def _step(self, in_time: bool | None) -> None:
-        """Continue the coroutine until it waits in a list or ends.
+        """Run the coroutine until it waits or ends. Its last call of `wait` returns `in_time`.
 
-        The call that it waits in returns `in_time`, which is None at the start.
+        At the start, there is no such call, and `in_time` is None.
         """
         with contextlib.suppress(StopIteration):  # raised when the coroutine has ended
             self.move_to(self._steps.send(in_time))
@@ -277,7 +274,7 @@ class ClientConnection(asyncio.Protocol):
     # -- called by the handler
 
     def send(self, message: JsonObject | bytes) -> None:
-        """Send a reply or an encoded line. Unfinished lists are sent first.
+        """Send a reply or an encoded line, after any lists that are still being sent.
 
         If too many lines wait, disconnect the client.
         """
@@ -288,7 +285,7 @@ class ClientConnection(asyncio.Protocol):
             self._write(line)
         elif len(self._outbox) < MAX_HELD_MESSAGES:
             self._outbox.append(line)
-            self.stream.count_held(len(line))
+            self.stream.adjust_held_bytes(len(line))
         else:
             self.stream.abort()
 
@@ -403,7 +400,7 @@ class ClientConnection(asyncio.Protocol):
             first = self._outbox[0]
             if isinstance(first, bytes):
                 self._outbox.popleft()
-                self.stream.count_held(-len(first))
+                self.stream.adjust_held_bytes(-len(first))
                 self._write(first)
             elif (message := next(first, None)) is None:
                 self._outbox.popleft()

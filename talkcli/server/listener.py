@@ -178,7 +178,7 @@ def _identity(path: str) -> tuple[int, int] | None:
 
 
 def _already_served(pid: int | None, path: str, *, on_this_machine: bool) -> AddressInUse:
-    """Return an error saying that another server uses the path.
+    """Return an error that says which server uses a path, and how to stop the server.
 
     `pid` is the id of its process, if known. It can be killed only on this machine.
     """
@@ -296,10 +296,9 @@ def _bind(path: str, mode: int) -> socket.socket:
 
 
 def _acquire_lock(path: str) -> int:
-    """Lock a socket's path. Return the descriptor of the lock file.
+    """Lock a socket's path, or raise AddressInUse. Return the descriptor of the lock file.
 
-    Raise AddressInUse if another server holds the lock. The file contains the id of this process. Closing the
-    descriptor ends the lock.
+    The file contains the id of this process. Closing the descriptor ends the lock.
     """
     while True:
         fd = _open_lock(f"{path}.lock")

@@ -96,7 +96,7 @@ class Requests:
 
     def shut_down(self) -> None:
         """End all goals, including waiting ones, and reject new ones."""
-        notifications = self._cancel_waiting(self._select_waiting(Cancel()), None)
+        notifications = self._mark_canceled(self._select_waiting(Cancel()), None)
         self._speech.shut_down()
         resume_all(self._speech.waiting_for_voices)
         self._speech.notifications.add(notifications)
@@ -143,9 +143,9 @@ class Requests:
             each.resume()
 
     def _reserve_memory(self, pending: PendingRequest) -> bool:
-        """Reserve memory for a waiting request. Return False if too many requests wait.
+        """Reserve memory for a waiting request. If too many wait, set its refusal and return False.
 
-        In this case, set `refusal`. The request is carried out without waiting, and the refusal rejects its goal.
+        In this case, the request is carried out without waiting, and the refusal rejects its goal.
         """
         if pending.kept_bytes:
             return True  # the request has waited before
@@ -168,7 +168,7 @@ class Requests:
             self._room_check = asyncio.get_running_loop().call_soon(self._submit_waiting_goals)
 
     def _submit_waiting_goals(self) -> None:
-        """Resume waiting `say` requests if the queue now has room."""
+        """Resume the waiting `say` requests whose goals now fit into the queue."""
         self._room_check = None
         without_room: set[object] = set()
         for each in list(self._speech.waiting_for_room):
@@ -193,12 +193,12 @@ class Requests:
         # Waiting goals of a disconnected client are dropped instead of cancelled.
         return [each for each in selected if not each.connection.detect_hang_up()]
 
-    def _cancel_waiting(self, goals: list[PendingRequest], by: By | None) -> list[Callable[[], None]]:
-        """Mark waiting goals as cancelled. Return the functions that end them.
+    def _mark_canceled(self, requests: list[PendingRequest], by: By | None) -> list[Callable[[], None]]:
+        """Mark waiting `say` requests as cancelled. Return the functions that end their goals.
 
         The functions submit the goals to the scheduler, which recalls them.
         """
-        new = [each for each in goals if each.waiting_list is not self._speech.canceled_goals]
+        new = [each for each in requests if each.waiting_list is not self._speech.canceled_goals]
         for each in new:
             each.canceled_by = by
             each.move_to(self._speech.canceled_goals)
@@ -228,7 +228,7 @@ class Requests:
                 self._room_check.cancel()
                 self._submit_waiting_goals()
             _, refusal = self._check_goal(pending, say)
-            if say.patient and scheduler.lacks_room(say, now, refusal) and self._reserve_memory(pending):
+            if say.patient and scheduler.only_lacks_room(say, now, refusal) and self._reserve_memory(pending):
                 waited = await self._await_room(pending, say)
         now = speech.advance_time()
         say, refusal = self._check_goal(pending, say)
@@ -293,7 +293,7 @@ class Requests:
         return producer is None or producer.detect_hang_up()
 
     def _check_goal(self, pending: PendingRequest, say: Say) -> tuple[Say, Refusal | None]:
-        """Look up a goal's voice. Return the goal with the voice's id, and any refusal.
+        """Look up a goal's voice. Return the goal with the voice's id, and any reason to reject it.
 
         Refusals that need a clock, files or other I/O belong here. The scheduler decides about all others.
         """
@@ -328,7 +328,7 @@ class Requests:
         speech, client = self._speech, pending.connection.client
         now = speech.advance_time()
         waiting = self._select_waiting(selection)
-        notifications = self._cancel_waiting(waiting, By(client=client))
+        notifications = self._mark_canceled(waiting, By(client=client))
         ids = {each.request.id for each in waiting if isinstance(each.request, Say)}
         result = self._scheduler.cancel(selection, client, now, ids)
         speech.apply(result.effects)  # carry out the effects first, because thousands of notifications may follow
@@ -382,13 +382,13 @@ class Requests:
             resume_all(speech.waiting_for_silence[active])  # requests that wait for silence can be answered now
         self._answer_pause(pending, active)
 
-    def _publish_pause(self, affected: Record | None, pending: PendingRequest) -> None:
+    def _publish_pause(self, active: Record | None, pending: PendingRequest) -> None:
         """Publish and log that speech was paused or resumed.
 
-        `affected` is the goal being spoken, if any.
+        `active` is the goal being spoken, if any.
         """
         paused, client = self._scheduler.paused, pending.connection.client
-        goal_id = affected.id if affected else None
+        goal_id = active.id if active else None
         publish = self._speech.subscribers.paused_changed
         self._speech.notifications.add([partial(publish, goal_id, paused=paused, by=By(client=client), at=time.time())])
         log.write(f"{'paused' if paused else 'resumed'} by {describe_sender(client)}")

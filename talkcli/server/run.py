@@ -111,7 +111,7 @@ class Server:
         self.speech = Speech(self._scheduler, settings.player_options)
         self.speech.on_failure = self._begin_shutdown
         self.speech.voices.driver = settings.driver
-        self._systemd = ServiceManager(self._loop, self.speech.status_words)
+        self._systemd = ServiceManager(self._loop, self.speech.status_message)
         self.speech.on_status_change = self._systemd.schedule_status
         self._requests = Requests(self.speech, self._describe)
         self.handle, self.is_waiting = self._requests.handle, self._requests.is_waiting
@@ -287,13 +287,13 @@ class Server:
 
     # -- shutdown
 
-    def _begin_shutdown(self, fatal: TalkError | None = None) -> None:
+    def _begin_shutdown(self, cause: TalkError | None = None) -> None:
         """Start to shut down: end all goals and reject new ones.
 
         Args:
-            fatal: the error that caused the shutdown, if any.
+            cause: the error that caused the shutdown, if any.
         """
-        self._fatal_error = fatal or self._fatal_error
+        self._fatal_error = cause or self._fatal_error
         self._systemd.notify_stopping()
         self._requests.shut_down()
 

@@ -87,7 +87,7 @@ class Speech:
         self._player_options = player_options
         #: the supervisor of the engine, set before the first client connects
         self.engine: Supervisor
-        #: called when `status_words` may have changed
+        #: called when `status_message` may have changed
         self.on_status_change: Callable[[], None] = lambda: None
         #: called when a goal was added to the queue or removed from it
         self.on_queue_change: Callable[[], None] = lambda: None
@@ -109,7 +109,7 @@ class Speech:
         #: set when an engine is ready or can't be started, and when the server shuts down
         self.engine_known = asyncio.Event()
         self._loop = asyncio.get_running_loop()
-        self.subscribers = Subscribers(self._waiting_for_room)
+        self.subscribers = Subscribers(self._waiting_connections)
         self.streams = ClientStreams()
         self.notifications = Notifications(self.streams)
         self.notifications.on_done = self._finish_if_all_ended
@@ -127,7 +127,7 @@ class Speech:
         #: whether there is a next goal, and whether its voice is neural, as last reported to the engine
         self._announced_next = False, False
 
-    def status_words(self) -> str:
+    def status_message(self) -> str:
         """Return a short status message that every user may read."""
         scheduler, ready = self.scheduler, self.ready
         if self.engine_status != READY:
@@ -145,7 +145,7 @@ class Speech:
         """Whether the engine is still expected to list its voices."""
         return self.voices.listed is None and self.engine_status in {"starting", READY}
 
-    def _waiting_for_room(self) -> Iterator[ClientConnection]:
+    def _waiting_connections(self) -> Iterator[ClientConnection]:
         """Yield the connections that wait for room in the queue or for a text to be heard."""
         for each in chain(self.waiting_for_room, *self.waiting_for_hearing.values()):
             yield each.connection
@@ -354,7 +354,7 @@ class Speech:
             case protocol.VoiceLoaded():
                 _log_voice_load(event)
                 imported = event.seconds > 0
-                self.apply(scheduler.voice_load_ended(event.voice, event.error, now, has_libraries=imported))
+                self.apply(scheduler.voice_load_ended(event.voice, event.error, now, imported_libraries=imported))
             case protocol.VoiceMemory():
                 self.apply(scheduler.voices_measured(event.voice, event.memory, now))
             case protocol.VoiceUnloaded():
@@ -398,7 +398,7 @@ class Speech:
         self.apply(effects)
 
     def _handle_ready(self, ready: protocol.Ready, now: Now) -> None:
-        """Record that an engine is ready, and start the next goal. The first engine also sets the default voice."""
+        """Record that an engine is ready, and start the next goal. The first one sets the default voice."""
         if self.ready is None and ready.voice is not None:
             self.apply(self.scheduler.change_settings({"voice": ready.voice}, now))
         if self.ready is None or self.ready != replace(ready, player=self.ready.player):

@@ -171,8 +171,8 @@ class ClientStream:
         """Size of the output that has not been sent yet."""
         return len(self._unread)
 
-    def count_held(self, added_bytes: int) -> None:
-        """Adjust the size of the output held by the receiver. Enforce the total limit."""
+    def adjust_held_bytes(self, added_bytes: int) -> None:
+        """Count output that the receiver holds back. Disconnect slow clients above the total limit."""
         if self in self._streams.open:
             self.held_bytes += added_bytes
             self._streams.unread_bytes += added_bytes

@@ -82,10 +82,7 @@ class Subscribers:
             waiting.pop(connection, None)
 
     def state_changed(self, record: Record, state: State, at: float) -> None:
-        """Publish a goal's new state, and its result if it has ended.
-
-        Waiting clients are then unsubscribed.
-        """
+        """Publish a goal's new state. If it has ended, send the result and end its subscriptions."""
         event = StateChanged(record.id, state, at, next(self._numbers))
         if self._watchers:
             # The first and the last event of a goal contain the whole goal.
@@ -137,7 +134,7 @@ class Subscribers:
             self._alive_timer = self._loop.call_later(CLIENT_ALIVE_INTERVAL_S, self._send_alive)
 
     def _feedback_receivers(self, waiters: Iterable[dict[ClientConnection, bool]]) -> dict[ClientConnection, None]:
-        """Return all connections that watch, and all waiting connections that want feedback."""
+        """Return all watching connections, and those among the waiters that want feedback."""
         listeners = dict(self._watchers)
         for each in waiters:
             listeners.update((connection, None) for connection, feedback in each.items() if feedback)
@@ -227,7 +224,7 @@ class Notifications:
             self._next_call = self._loop.call_soon(self._work, min(unread_before, self._streams.unread_bytes))
 
     def _await_readers(self, unread_before: int, until: float) -> None:
-        """Resume calling functions once clients have read the new output, or at `until`."""
+        """Continue `_work` once the unread output is down to `unread_before` bytes, or at `until`."""
         if self._streams.unread_bytes <= unread_before:
             self._work(unread_before)
         elif self._loop.time() < until:

@@ -97,7 +97,7 @@ class VoiceCatalog:
 
     @staticmethod
     def _missing_part(voice: str) -> str | None:
-        """Return an error message if a neural voice lacks its speaker or a package."""
+        """Return an error message if a neural voice's speaker or a required package is missing."""
         model, mark, speaker = voice.partition(SPEAKER_MARK)
         if mark:
             try:

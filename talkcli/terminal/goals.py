@@ -295,7 +295,7 @@ def _describe_cause(by: By) -> str:
 
 
 def listed_reason_forms(goal: Goal, screen: Screen) -> list[str]:
-    """Return descriptions of why a goal in a list ended, longest first.
+    """Return descriptions of why a listed goal ended, longest first, usually without its duration.
 
     The duration is only shown with `screen.long`.
     """

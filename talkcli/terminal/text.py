@@ -259,10 +259,7 @@ class MeasuredText:
         return "".join(self._shown[start:end])
 
     def _first_shown(self, column: int, max_index: int) -> int:
-        """Return the index of the first character to show to the right of `column`.
-
-        Return `max_index` if no earlier character does.
-        """
+        """Return the index of the first character to show right of `column`, at most `max_index`."""
         if column <= 0:
             return 0
         # The ellipsis needs one more column. The first visible character must not be a combining mark.

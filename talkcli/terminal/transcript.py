@@ -106,7 +106,7 @@ class Transcript:
         self._widths = widths or ColumnWidths()
 
     def lines(self, event: Event, screen: Screen, now: float) -> list[str]:
-        """Store an event's goal. Return the lines that show the event.
+        """Update the stored goals after an event. Return the lines that show the event.
 
         `now` is shown if the event has no time.
         """
@@ -170,9 +170,7 @@ class Transcript:
         return self._format_goal(goal, event.state, at, screen)
 
     def _format_growth(self, event: TextAdded | TextMissing, screen: Screen, now: float) -> list[str]:
-        """Record added text. Return the lines that show its new sentences.
-
-        If the goal waits for text, return a line that says so.
+        """Record added text, or a wait for text. Return lines for new sentences and for the wait.
 
         A goal also waits before its first word, until there is enough text. This isn't shown.
         """

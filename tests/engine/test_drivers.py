@@ -291,7 +291,7 @@ espeak.load_library = without_english
     [
         (
             {"before": NO_LIBRARY + "sys.modules['espeakng_loader'] = None"},
-            ["libespeak-ng is missing (libespeak-ng.so.1: ", f"); install it with: {install.espeak_library()}"],
+            ["libespeak-ng is missing (libespeak-ng.so.1: ", f"); install it with: {install.espeak_command()}"],
             {"permanent": True},
         ),
         (

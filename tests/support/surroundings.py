@@ -62,7 +62,7 @@ def needs_no_server() -> None:
                 probe.connect(path)
                 state = "a server runs"
             except OSError as error:
-                state = paths.describe_place(path, error)
+                state = paths.connect_failure(path, error)
         if state != paths.PLACE_ABSENT:
             _skip(f"needs a machine on which no talk server runs; {path}: {state}")
 

@@ -113,7 +113,7 @@ class Robot:
 
     def end_loading(self, voice: str, error: str | None) -> None:
         """Report as the engine that a voice was loaded or could not be loaded."""
-        self.collect(self.scheduler.voice_load_ended(f"piper/{voice}", error, self.now, has_libraries=True))
+        self.collect(self.scheduler.voice_load_ended(f"piper/{voice}", error, self.now, imported_libraries=True))
 
     def report(self, event: str, goal_id: str) -> None:
         """Report an event of a goal as the engine."""
@@ -140,12 +140,12 @@ class Robot:
             verb, *words = step.split()
             if len(verb) == 1:
                 given = options(words)
-                parameters = {"waited": "waited_s", "fault": "refusal", "canceled": "canceler"}
+                parameters = {"waited": "waited_s", "fault": "server_refusal", "canceled": "canceled_by"}
                 known = {name: given.pop(option) for option, name in parameters.items() if option in given}
-                if "refusal" in known:
-                    known["refusal"] = Reason(known["refusal"]), "it can't be had"
-                if "canceler" in known:
-                    known["canceler"] = By(client=DOOR)
+                if "server_refusal" in known:
+                    known["server_refusal"] = Reason(known["server_refusal"]), "it can't be had"
+                if "canceled_by" in known:
+                    known["canceled_by"] = By(client=DOOR)
                 self.submit(Say(**{"text": verb, **given}), verb, **known)
             elif verb == "append":
                 self.append(self._id(words[0]), **options(words[1:]))

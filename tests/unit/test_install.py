@@ -62,7 +62,7 @@ def test_the_command_names_the_running_python() -> None:
 
 def test_a_32_bit_system_is_not_offered_packages_without_a_build(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(install, "IS_64_BIT", False)
-    assert install.espeak_library() == "sudo apt-get install -y libespeak-ng1"
+    assert install.espeak_command() == "sudo apt-get install -y libespeak-ng1"
     step = "neural voices need a 64-bit system; use an espeak voice, such as en"
     monkeypatch.setattr(install, "NEURAL_PACKAGES", ["no_such_package"])
     assert missing_package() == f"no_such_package is missing; {step}"

@@ -253,7 +253,7 @@ def test_a_cancel_selects_among_goals_that_wait_for_room(selection: Cancel, chos
 
 def test_a_goal_lacks_room_only_if_nothing_else_is_wrong_with_it() -> None:
     robot = play("room 1; a")
-    assert not robot.scheduler.lacks_room(Say("x"), robot.now)
+    assert not robot.scheduler.only_lacks_room(Say("x"), robot.now)
     robot.play("b id=mine key=face")
     cases = {
         True: [Say("x"), Say("x", preempt=True, priority=-1), Say("x", key="other")],
@@ -264,12 +264,12 @@ def test_a_goal_lacks_room_only_if_nothing_else_is_wrong_with_it() -> None:
     }
     for lacks, says in cases.items():
         for say in says:
-            assert robot.scheduler.lacks_room(say, robot.now) is lacks, say
-    assert not robot.scheduler.lacks_room(Say("x"), robot.now, (Reason.UNKNOWN_VOICE, "no such voice"))
+            assert robot.scheduler.only_lacks_room(say, robot.now) is lacks, say
+    assert not robot.scheduler.only_lacks_room(Say("x"), robot.now, (Reason.UNKNOWN_VOICE, "no such voice"))
     robot.play("cancel early")
-    assert not robot.scheduler.lacks_room(Say("x", id="early"), robot.now), "it is RECALLED at once"
+    assert not robot.scheduler.only_lacks_room(Say("x", id="early"), robot.now), "it is RECALLED at once"
     robot.play("cancel mine")
-    assert not robot.scheduler.lacks_room(Say("x"), robot.now)
+    assert not robot.scheduler.only_lacks_room(Say("x"), robot.now)
 
 
 def test_a_goal_stops_waiting_for_room_if_it_has_room_or_never_will() -> None:

@@ -98,7 +98,7 @@ class Checked(Robot):
 
     def submit(self, say: Say, name: str = "", **known: Any) -> Record:
         before = self.scheduler.unfinished()
-        full = self.scheduler.lacks_room(say, self.now)
+        full = self.scheduler.only_lacks_room(say, self.now)
         record = super().submit(say, name, **known)
         if self.records.get(record.id) is record:
             return record  # the goal was sent before

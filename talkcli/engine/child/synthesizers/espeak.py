@@ -136,7 +136,7 @@ def _preload_library() -> tuple[str, bytes | None]:
     except (ImportError, OSError) as error:
         if _is_temporary(error):
             raise
-        step = f"install it with: {install.espeak_library()}"
+        step = f"install it with: {install.espeak_command()}"
         raise NotInstalled(f"libespeak-ng is missing ({missing}); {step}") from error
     return "espeakng-loader", str(espeakng_loader.get_data_path()).encode()
 
