@@ -22,7 +22,7 @@ from talkcli.client.goal import GoalHandle
 from talkcli.errors import Lost, UnknownGoal, UsageError
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.goal import Goal
-from talkcli.goals.options import MAX_ID_CHARS, MAX_IDS, MAX_LOG_GOALS, STALL_S, Cancel, Say, Set, bad_option, check_key
+from talkcli.goals.options import MAX_ID_CHARS, MAX_IDS, MAX_LOG_GOALS, STALL_S, Cancel, Say, Set, bad_option, key_error
 from talkcli.goals.states import State
 from talkcli.protocol.events import Canceled, ServerStatus, Snapshot, goal_in, goals
 from talkcli.protocol.lines import MAX_LINE_BYTES, request_line, request_to_json
@@ -294,7 +294,7 @@ class Client:
         first, *others = [None] if wanted is None else batches(wanted) or [()]
         last = None if before is None else self._full_id(before)
         requests = [Cancel(first, current, last, key), *map(Cancel, others)]
-        if key is not None and (fault := check_key(key)):
+        if key is not None and (fault := key_error(key)):
             raise UsageError(fault)
         items: list[JsonObject] = []
         unknown: list[str] = []

@@ -284,7 +284,7 @@ class Word:
 
 @frozen
 class TextMissing:
-    """The goal is silent because text is missing, or it is heard again.
+    """The goal has fallen silent because the next text hasn't arrived, or it has resumed.
 
     While the goal is silent, the event is repeated after long additions that can't be spoken yet.
     """

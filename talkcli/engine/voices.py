@@ -279,7 +279,7 @@ def _suggest_names(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
 
 
 def _split_variants(voices: Sequence[Voice]) -> tuple[list[Voice], list[Voice]]:
-    """Return the ordinary voices and the variants. Omit neural voices."""
+    """Return the ordinary voices, and the variants such as "+f3". Omit neural voices."""
     plain = [each for each in voices if not each.id.startswith((VARIANT_PREFIX, NEURAL_PREFIX))]
     return plain, [each for each in voices if each.id.startswith(VARIANT_PREFIX)]
 

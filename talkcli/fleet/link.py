@@ -139,7 +139,7 @@ class Link:
         self._paho.on_log = self._on_log
 
     def open(self) -> None:
-        """Connect to the broker and log in.
+        """Connect to the broker, and wait until it has accepted the login.
 
         Raises:
             ServerUnavailable: no broker answers.

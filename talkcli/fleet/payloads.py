@@ -77,9 +77,9 @@ class Presence:
 
 
 def bridge_rank(presence: Presence | None) -> tuple[float, str] | None:
-    """Return a bridge's rank among the bridges of one robot. Return None if it is offline.
+    """Return a bridge's rank. If several bridges use one robot name, the lowest rank keeps it.
 
-    The bridge with the lowest rank keeps the robot's name. The others exit.
+    The other bridges exit. Return None if the bridge is offline.
     """
     if presence is None or presence.since is None or not (presence.online and presence.session):
         return None
@@ -124,7 +124,7 @@ class RobotStatus:
         return cls(**found, last=LastGoal(**last) if "id" in last and "state" in last else None)
 
     def events(self) -> list[StateChanged]:
-        """Return the events of the last goal and the active goal in this status."""
+        """Return events that describe the last goal and the active goal in this status."""
         last, found = self.last, []
         if last:
             ended = Goal(last.id, last.state, last.text, last.reason, ended_at=last.at)

@@ -72,8 +72,8 @@ def homeassistant_device(name: str) -> str:
     return "/".join((HOMEASSISTANT, "device", f"{PREFIX}-dots", escaped, "config"))
 
 
-def parse_request(topic: str) -> tuple[str, str] | None:
-    """Return the kind and the user name in a request topic. For other topics, return None.
+def parse_request_topic(topic: str) -> tuple[str, str] | None:
+    """Return the kind of request and the user name in a topic. For other topics, return None.
 
     Returns:
         REQUEST, PLAIN_SAY or PLAIN_CANCEL, and the client's user name. The broker's access rules verify the name.

@@ -201,10 +201,7 @@ def message_details(message: str | None) -> str:
 
 
 def _create_reader(kind: type) -> Callable[[object], object]:
-    """Return a function that accepts only values of this type.
-
-    The function returns None for all other values.
-    """
+    """Return a function that returns values of this type unchanged, and None for other values."""
     return lambda value: value if type(value) is kind else None
 
 

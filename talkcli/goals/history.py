@@ -97,9 +97,9 @@ class SpeechTimes:
                 _set_newest(self._starts, each, (record.began_at, record.id), MAX_SPEECH_TIMES)
 
     def last_goal_id(self, since: float, key: str | None, text: str) -> str | None:
-        """Return the id of the last goal with this key or text that started after `since`, if any.
+        """Return the id of the last goal after `since` with this key, or with this text if key is None.
 
-        The text counts only if `key` is None. Times are monotonic.
+        Return None if no such goal has started. Times are monotonic.
         """
         last = self._starts.get(_digest(text) if key is None else key)
         return last[1] if last is not None and last[0] > since else None

@@ -280,21 +280,21 @@ class Option:
         return replace(self, default=setting.initial, special_flags=flags, help=setting.serve_help or self.help)
 
 
-def _check_priority(value: int) -> str | None:
+def _priority_error(value: int) -> str | None:
     """Return an error message if a priority is out of range."""
     if -MAX_PRIORITY <= value <= MAX_PRIORITY:
         return None
     return f"the priority must be {-MAX_PRIORITY:,} to {MAX_PRIORITY:,}, got {value}"
 
 
-def check_key(value: str) -> str | None:
+def key_error(value: str) -> str | None:
     """Return an error message if a string is not a valid key."""
     if 0 < len(value) <= MAX_KEY_CHARS:
         return None
     return f"the key must have 1 to {MAX_KEY_CHARS} characters, got {len(value)}"
 
 
-def _check_own_id(value: str) -> str | None:
+def _own_id_error(value: str) -> str | None:
     """Return an error message if a client may not choose this id."""
     if is_clients_id(value):
         return None
@@ -304,7 +304,7 @@ def _check_own_id(value: str) -> str | None:
     )
 
 
-def _check_voice(value: str) -> str | None:
+def _voice_error(value: str) -> str | None:
     """Return an error message if the name of a voice is empty."""
     return None if value else "the voice must not be empty"
 
@@ -372,7 +372,7 @@ OPTIONS = (
         "goals with a higher priority are spoken first, and goals with the same priority in the order of arrival",
         default=0,
         # The range is not in `limits`, because the help text would then show it.
-        check=_check_priority,
+        check=_priority_error,
         form=f"{-MAX_PRIORITY:,} to {MAX_PRIORITY:,}",
         help="Set the priority. Sentences with a higher priority are spoken first. This sentence never interrupts or "
         "flushes them.",
@@ -399,7 +399,7 @@ OPTIONS = (
         "key",
         WORD,
         "replace the waiting goal that has the same key",
-        check=check_key,
+        check=key_error,
         form=f"1 to {MAX_KEY_CHARS} characters",
         help=f"Replace the waiting sentence with the same KEY. A key has up to {MAX_KEY_CHARS} characters.",
         completion="keys",
@@ -417,7 +417,7 @@ OPTIONS = (
         "id",
         WORD,
         "an id chosen by the sender; see *Ids* below",
-        check=_check_own_id,
+        check=_own_id_error,
         form=f"1 to {MAX_ID_CHARS} characters from `A-Z a-z 0-9 . _ : / -`",
         default_words="set by the server",
         help="Choose the goal's id. Until the server restarts, only one sentence is spoken with this id.",
@@ -448,7 +448,7 @@ OPTIONS = (
         "voice",
         WORD,
         f"id, name or language of the voice; `{DEFAULT_VOICE}` for the driver's default voice",
-        check=_check_voice,
+        check=_voice_error,
         help="Use this voice: an id, name or language from 'talk voices'.",
         env="TALK_VOICE",
         completion="voices",
@@ -732,12 +732,15 @@ def is_visible(text: str) -> bool:
 
 
 def bad_characters(text: str, max_chars: int | None, before_chars: int = 0) -> Refusal | None:
-    """Return a reason and a message if a text is too long or has forbidden characters. Otherwise, return None.
+    """Return a reason and a message if a text is too long or has forbidden characters.
 
     Args:
         text: the text.
         max_chars: the maximum number of characters, or None for no limit.
         before_chars: the length of the earlier parts of a growing text, which counts, too.
+
+    Returns:
+        None if the characters are allowed.
     """
     from talkcli.goals.reasons import Reason
 
@@ -775,7 +778,7 @@ def shown_settings(settings: Set) -> JsonObject:
 
 
 def _replace_none_values(values: dict[str, Any]) -> dict[str, Any]:
-    """Replace placeholder values, such as a `ttl` of 0, with None. Return the new settings."""
+    """Return a copy of settings. Placeholders for no value, such as a `ttl` of 0, become None."""
     return {name: None if value == _NONE_VALUES.get(name) else value for name, value in values.items()}
 
 

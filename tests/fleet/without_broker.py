@@ -42,7 +42,7 @@ class SessionsWithoutBroker:
         payload = fields if isinstance(fields, bytes) else json.dumps(fields).encode()
         full_name = _full_name(session)
         topic = f"talk/robot/anna/request/{full_name.partition('/')[0]}"
-        parsed = topics.parse_request(topic)
+        parsed = topics.parse_request_topic(topic)
         assert parsed
         message = Message(topic, payload, response=f"talk/reply/{full_name}", correlation=correlation)
         now = self._policy.newest_echo_at = self._boottime()

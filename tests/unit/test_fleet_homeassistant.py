@@ -35,7 +35,7 @@ def test_an_announcement_follows_home_assistants_rules(name: str) -> None:
     }  # fmt: skip
     for key in ("say", "cancel"):
         topic = payload["components"][key]["command_topic"]
-        assert topics.parse_request(topic) == (key, "homeassistant")
+        assert topics.parse_request_topic(topic) == (key, "homeassistant")
         assert topic.startswith(f"talk/robot/{name}/")
         assert not payload["components"][key].get("retain")  # retained requests are never spoken
     assert {*payload["components"]["last"]["options"]} == {state.name for state in State if state.terminal}

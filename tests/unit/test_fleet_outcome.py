@@ -22,8 +22,8 @@ from talkcli.fleet.desk.request import (
     NoServer,
     Outcome,
     RobotOffline,
+    cancel_outcomes,
     failure_outcome,
-    outcomes_of_cancel,
     reply_outcomes,
 )
 from talkcli.goals.goal import Goal
@@ -113,4 +113,4 @@ def test_the_reply_to_a_status_request_for_a_goal_must_contain_it() -> None:
 
 
 def test_goals_of_a_refused_cancel_are_not_the_last_outcomes() -> None:
-    assert [outcome.last for outcome in outcomes_of_cancel("anna", [{"canceled": ENDED}], last=False)] == [False]
+    assert [outcome.last for outcome in cancel_outcomes("anna", [{"canceled": ENDED}], last=False)] == [False]

@@ -37,7 +37,7 @@ Decision = RemoteRequest | Refusal | Goodbye | Ignored
 
 
 def decide(message: Message, *, stale: bool = False, allow: tuple[str, ...] = policy.ALLOWABLE_REQUESTS) -> Decision:
-    parsed = topics.parse_request(message.topic)
+    parsed = topics.parse_request_topic(message.topic)
     assert parsed
     rules = Policy("anna", allow)
     rules.newest_echo_at = NOW - (6.01 if stale else 6)

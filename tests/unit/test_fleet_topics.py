@@ -42,7 +42,7 @@ def test_a_name_that_is_not_a_plain_topic_level_is_refused(name: str) -> None:
     ],
 )
 def test_a_topic_contains_the_request_and_the_user(topic: str, parsed: tuple[str, str] | None) -> None:
-    assert topics.parse_request(topic) == parsed
+    assert topics.parse_request_topic(topic) == parsed
 
 
 @pytest.mark.parametrize(

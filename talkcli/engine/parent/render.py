@@ -132,7 +132,7 @@ def render(
 
 
 def split_into_pieces(text: str) -> Iterator[str]:
-    """Split a text into pieces. Prefer the end of a sentence or a word."""
+    """Split a text into pieces of limited length, if possible after a sentence or a word."""
     start = 0
     while len(text) - start > MAX_PIECE_CHARS:
         limit = start + MAX_PIECE_CHARS
@@ -308,10 +308,10 @@ def _resolve_target(path: str) -> str:
     return target
 
 
-def _is_own_output(status: os.stat_result) -> bool:
+def _is_own_output(file_stat: os.stat_result) -> bool:
     """Return whether the file is this process's own standard output or standard error."""
     for descriptor in (1, 2):
         with contextlib.suppress(OSError):  # the descriptor is closed
-            if os.path.samestat(status, os.fstat(descriptor)):
+            if os.path.samestat(file_stat, os.fstat(descriptor)):
                 return True
     return False

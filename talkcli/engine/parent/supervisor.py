@@ -48,9 +48,9 @@ class EngineDied:
 
 @frozen
 class EngineMissing:
-    """The engine has failed to start for a long time.
+    """No engine process could be started for a long time, so the next goal fails.
 
-    The next goal fails with this message.
+    It fails with this message.
     """
 
     message: str
@@ -223,7 +223,7 @@ class Supervisor:
         self._actions.call(lambda: self._begin_goal(command))
 
     def append(self, goal_id: str, text: str, *, complete: bool, broke_off: bool) -> None:
-        """Replace the goal's text with a longer one.
+        """Replace the goal's text with a longer version, and send the new part to the process.
 
         Args:
             goal_id: the id of the goal.
@@ -257,14 +257,14 @@ class Supervisor:
         self._actions.call(lambda: self._send(command))
 
     def load(self, voice: str) -> None:
-        """Load a neural voice if an engine process is ready.
+        """Tell the engine process to load a neural voice, if the process is ready.
 
         `VoiceLoaded` is posted when loading has finished or failed.
         """
         self._actions.call(lambda: self._load_voice(voice))
 
     def drop(self, voice: str) -> None:
-        """Unload a neural voice."""
+        """Tell the engine process to unload a neural voice, if the process is ready."""
         self._actions.call(lambda: self._send(protocol.DropVoice(voice)))
 
     def give_up(self, goal_id: str) -> None:
@@ -488,7 +488,7 @@ class Supervisor:
             self._handle_event(process, event)
 
     def _handle_crash(self, process: EngineProcess) -> None:
-        """Clean up after a process that has crashed, and post how it exited."""
+        """Retry or end the goal of a crashed process, and post how the process exited."""
         self._lose_process(f"the engine crashed: {process.describe_exit()}", Reason.ENGINE_CRASHED)
 
     def _handle_event(self, process: EngineProcess, event: protocol.Event) -> None:
@@ -577,7 +577,7 @@ class Supervisor:
             self._post(EngineMissing(message))
 
     def _release_process(self, process: EngineProcess) -> None:
-        """Release a process that has exited, and end its goal."""
+        """Close the descriptors of a process that has exited. End its goal unless it is retried."""
         del self._watched[process.liveness]
         if self._watched.pop(process.stderr, None):
             process.read_stderr()

@@ -372,7 +372,7 @@ class Bridge:
             return
         if message.topic == topics.HOMEASSISTANT_STATUS and message.payload == b"online":
             self._loop.call_later(random.uniform(0, _DEVICE_DELAY_S), self._publish_device)
-        topic = topics.parse_request(message.topic)
+        topic = topics.parse_request_topic(message.topic)
         if topic is None or not self._online:
             return
         decision = self._policy.decide(message, *topic, boottime())
@@ -391,7 +391,10 @@ class Bridge:
                 self._send_echo()
 
     def _handle_echo(self, payload: bytes) -> None:
-        """Process a returned echo, or the question of whether the robot's name is in use."""
+        """Record a returned echo, or answer a bridge that asks whether the robot's name is in use.
+
+        If this bridge's own question returns, go online unless another bridge answers.
+        """
         if payload.startswith(_RIVAL_QUESTION):
             if payload != _RIVAL_QUESTION + self._session.encode():
                 if self._online:

@@ -128,7 +128,7 @@ class Policy:
         self.newest_echo_at = 0.0
 
     def record_echo(self, sent_at_text: bytes, now: float) -> None:
-        """Record when a returned echo was sent.
+        """Record the sending time of an echo, which is a message from the bridge to itself.
 
         Ignore it if its time is invalid or later than `now`.
         """
@@ -222,7 +222,7 @@ class SentIds:
         return self._sent[goal_id][1] if goal_id in self._sent else None
 
     def is_counted(self, goal_id: str, boot: str) -> bool:
-        """Return whether a goal of the server with this boot id counts towards the limit."""
+        """Return whether a goal was sent to the server with this boot id and counts towards the limit."""
         return self.boot_of(goal_id) == boot and self._sent[goal_id][2]
 
     def add(self, goal_id: str, boot: str, user: str, *, counted: bool = True) -> None:
@@ -277,9 +277,9 @@ class RemoteGoals:
         self._goals.setdefault(goal_id, (key, False))
 
     def record_reply(self, goal_id: str, *, pending: bool) -> None:
-        """Record whether a goal is pending, according to the server's reply to `say`.
+        """Record that a goal is pending, or remove it, according to the server's reply to `say`.
 
-        If it isn't, remove the goal. The reply is ignored if an event has already confirmed that the goal is pending.
+        The reply is ignored if an event has already confirmed that the goal is pending.
 
         Args:
             goal_id: the goal's id.
@@ -309,7 +309,7 @@ class RemoteGoals:
 
 
 def without_texts(message: JsonObject, hidden: tuple[str, ...] = ("text", "spoken")) -> JsonObject:
-    """Return a copy of a message. The given fields of its goals are null."""
+    """Return a copy of a message in which the `hidden` fields of each goal are null."""
     return {
         name: {**each, **dict.fromkeys(hidden)} if isinstance(each, dict) and "text" in each else each
         for name, each in message.items()

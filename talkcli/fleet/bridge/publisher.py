@@ -206,10 +206,7 @@ class Publisher:
             self._last = event.goal or self._last
 
     def _add_text(self, event: TextAdded) -> None:
-        """Add text to the stored beginning of a goal's text.
-
-        Publish the status if it shows the added text.
-        """
+        """Extend the stored beginning of a goal's text. Update the status if it shows the text."""
         known = self._texts.get(event.id)
         if known and len(known) < _MAX_STATUS_TEXT_CHARS:
             self._texts[event.id] = (known + event.text)[:_MAX_STATUS_TEXT_CHARS]

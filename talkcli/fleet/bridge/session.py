@@ -182,7 +182,7 @@ class RemoteSessions:
             self.cancel_waiting(Cancel(), canceled_by)
         while self.waiting and self.goals.has_room(self.waiting[0][1]):
             request, say, session = self.waiting.pop(0)
-            session.send_say(request, say, has_room=True)
+            session.send_say(request, say, ignore_limit=True)
 
     # -- from the publisher
 
@@ -215,9 +215,9 @@ class RemoteSessions:
 class _RemoteExchange(Exchange):
     """A remote client's request that was sent to the server."""
 
-    def __init__(self, remote: RemoteRequest, request: Request, *, is_new: bool = False) -> None:
+    def __init__(self, remote_request: RemoteRequest, request: Request, *, is_new: bool = False) -> None:
         super().__init__(request)
-        self.remote = remote
+        self.remote_request = remote_request
         #: whether a `say` request sends its goal for the first time
         self.is_new = is_new
         #: goals that a `cancel` request has ended before they were sent to the server
@@ -326,7 +326,7 @@ class RemoteSession:
     @property
     def unanswered(self) -> list[RemoteRequest]:
         """The client's unanswered requests, including goals that are waiting for room."""
-        return [*self._queue, *(each.remote for each in self._exchanges), *self._find_waiting()]
+        return [*self._queue, *(each.remote_request for each in self._exchanges), *self._find_waiting()]
 
     def _find_waiting(self) -> list[RemoteRequest]:
         """Return the client's goals that are waiting for room in the server's queue."""
@@ -346,30 +346,30 @@ class RemoteSession:
 
     # -- to the server
 
-    def _send_request(self, remote: RemoteRequest) -> None:
+    def _send_request(self, remote_request: RemoteRequest) -> None:
         """Send a client's request to the server. Change, delay or refuse it if necessary."""
-        request = remote.request
+        request = remote_request.request
         if isinstance(request, Say):
-            self.send_say(remote, request)
+            self.send_say(remote_request, request)
         elif isinstance(request, Cancel):
-            self._send_cancel(remote, request)
+            self._send_cancel(remote_request, request)
         elif isinstance(request, Append) and (owner := self._sessions.ids.user_of(request.id)) != self._user:
             code = "not_sender" if owner else "unknown_goal"
-            self.refuse(remote, code, f"the goal {request.id} was not sent by {self._user}")
+            self.refuse(remote_request, code, f"the goal {request.id} was not sent by {self._user}")
         else:
             if isinstance(request, Hello):
                 self._name = policy.sender_name(self._user, request.name)
                 request = replace(request, name=self._name)
             self._watching = self._watching or isinstance(request, Watch)
-            self._send(_RemoteExchange(remote, request))
+            self._send(_RemoteExchange(remote_request, request))
 
-    def send_say(self, remote: RemoteRequest, say: Say, *, has_room: bool = False) -> None:
+    def send_say(self, remote_request: RemoteRequest, say: Say, *, ignore_limit: bool = False) -> None:
         """Send a goal to the server. If too many are pending, let it wait or reject it.
 
         Args:
-            remote: the client's request.
+            remote_request: the client's request.
             say: the goal in it.
-            has_room: whether the goal was waiting, and there is room for it now.
+            ignore_limit: whether to send the goal even if other goals are waiting.
         """
         shared, server = self._sessions, self._server
         assert server
@@ -378,22 +378,23 @@ class RemoteSession:
         owner = shared.ids.user_of(goal_id) or self._user
         if boot not in (None, server.boot):
             words = f"{goal_id} was sent to a server that has ended; it may have been spoken"
-            self.refuse(remote, "lost", words)
+            self.refuse(remote_request, "lost", words)
         elif say.more and owner != self._user:
-            self.refuse(remote, "not_sender", f"the goal {goal_id} was not sent by {self._user}")
-        elif has_room or (shared.goals.has_room(say) and not (counted and shared.waiting)):
-            if self._send(_RemoteExchange(remote, remote.build_say(goal_id, boottime()), is_new=boot is None)):
+            self.refuse(remote_request, "not_sender", f"the goal {goal_id} was not sent by {self._user}")
+        elif ignore_limit or (shared.goals.has_room(say) and not (counted and shared.waiting)):
+            request = remote_request.build_say(goal_id, boottime())
+            if self._send(_RemoteExchange(remote_request, request, is_new=boot is None)):
                 shared.ids.add(goal_id, server.boot, owner, counted=counted)
                 if counted:
                     shared.goals.add(goal_id, say.key)
         elif say.patient:
-            shared.waiting.append((remote, say, self))
+            shared.waiting.append((remote_request, say, self))
         else:
             words = f"{policy.MAX_REMOTE_GOALS} goals of remote clients are already waiting"
             # Like the server, don't give a rejected goal the id that its client has chosen.
-            self.end_goal(remote, replace(say, id=None), State.REJECTED, "queue_full", f"not spoken: {words}")
+            self.end_goal(remote_request, replace(say, id=None), State.REJECTED, "queue_full", f"not spoken: {words}")
 
-    def _send_cancel(self, remote: RemoteRequest, cancel: Cancel) -> None:
+    def _send_cancel(self, remote_request: RemoteRequest, cancel: Cancel) -> None:
         """Cancel waiting goals, and then send the `cancel` request to the server.
 
         The server doesn't know about waiting goals.
@@ -404,7 +405,7 @@ class RemoteSession:
             cancel = replace(cancel, ids=tuple(each for each in cancel.ids if each not in canceled))
         if cancel.before in canceled:
             cancel = replace(cancel, before=None, ids=cancel.ids or ())
-        exchange = _RemoteExchange(remote, cancel)
+        exchange = _RemoteExchange(remote_request, cancel)
         exchange.canceled = goals
         self._send(exchange)
 
@@ -412,7 +413,8 @@ class RemoteSession:
         """Send a request to the server. If it is too long, refuse it and return False."""
         assert self._server
         if not self._server.send(exchange):
-            self.refuse(exchange.remote, "line_too_long", f"the request is longer than {MAX_LINE_BYTES:,} bytes")
+            words = f"the request is longer than {MAX_LINE_BYTES:,} bytes"
+            self.refuse(exchange.remote_request, "line_too_long", words)
             return False
         return True
 
@@ -478,7 +480,7 @@ class RemoteSession:
         if not isinstance(exchange, _RemoteExchange):
             return []
         del message["seq"]
-        remote, request, goal = exchange.remote, exchange.remote.request, message.get("goal")
+        remote_request, request, goal = exchange.remote_request, exchange.remote_request.request, message.get("goal")
         state: State | None = None
         if isinstance(goal, dict):
             state = State.__members__.get(str(goal.get("state")))
@@ -495,7 +497,7 @@ class RemoteSession:
             count = message.get("count")
             if found and isinstance(count, int):
                 message["count"] = count + len(found)
-        return [(encode(item(remote.seq, **each)), remote.correlation) for each in (*found, message)]
+        return [(encode(item(remote_request.seq, **each)), remote_request.correlation) for each in (*found, message)]
 
     def _record_say_reply(self, exchange: _RemoteExchange, state: State | None, *, refused: bool) -> None:
         """Process the reply to a `say` request. Record whether its goal is pending.
@@ -515,14 +517,14 @@ class RemoteSession:
         self._publish([(encode(failure(request.seq, code, message)), request.correlation)])
 
     def end_goal(
-        self, remote: RemoteRequest, say: Say, state: State, reason: str, message: str, by: By | None = None
+        self, remote_request: RemoteRequest, say: Say, state: State, reason: str, message: str, by: By | None = None
     ) -> Goal:
         """End a goal that was never sent to the server, and inform the client. Return the ended goal.
 
         The client gets the lines that the server would send.
 
         Args:
-            remote: the client's request.
+            remote_request: the client's request.
             say: the goal in it.
             state: the goal's end state.
             reason: the machine-readable reason for the end.
@@ -532,7 +534,7 @@ class RemoteSession:
         goal_id, sender, now = say.id or self._new_goal_id(), Sender(name=policy.sender_name(self._user)), time.time()
         goal = Goal(goal_id, state, say.text, reason, by, message, client=sender, queued_at=now, ended_at=now)
         goal = replace(goal, **{name: getattr(say, name) for name in SHOWN_OPTIONS})
-        lines = [(encode(ok(remote.seq, goal=goal.to_json())), remote.correlation)]
+        lines = [(encode(ok(remote_request.seq, goal=goal.to_json())), remote_request.correlation)]
         if say.wait or say.feedback:
             events = StateChanged(goal_id, state, now).to_json(), Result(goal).to_json()
             lines += [(encode(each), None) for each in events]
@@ -593,11 +595,11 @@ class RemoteSession:
         shared.handle_pending_change()
 
 
-def _has_lasting_effect(remote: RemoteRequest) -> bool:
+def _has_lasting_effect(remote_request: RemoteRequest) -> bool:
     """Return whether a request must be carried out after its client has left.
 
     A `patient` goal is dropped in that case.
     """
-    request = remote.request
+    request = remote_request.request
     lasting = Append | Cancel | Set | Pause | Resume
     return not request.patient if isinstance(request, Say) else isinstance(request, lasting)

@@ -148,7 +148,10 @@ class DeskLink:
         return descriptor in ready
 
     def _receive(self, message: Message) -> None:
-        """Pass a message to the handler. For the marker message, only record its arrival."""
+        """Pass a message to the handler, or record that all retained messages have arrived.
+
+        The marker message shows that, because it comes back after the retained messages.
+        """
         if message.topic == self.reply_topic(topics.MARKER):
             self.marker_at = time.monotonic()
         else:
@@ -276,7 +279,7 @@ class DeskLink:
                 return TICK_EVERY_S
             return self.marker_at + RETAINED_GRACE_S - now
         if self._opening is not None and self._opening.done:
-            self._end_attempt(self._opening)
+            self._finish_connecting(self._opening)
             return 0.0
         if self._opening is None and now >= self._next_attempt_at:
             name = f"talk-desk-{self.user}-{self.session}"
@@ -289,8 +292,8 @@ class DeskLink:
             self._opening = LinkOpener(new, self.wake)
         return TICK_EVERY_S if self._opening else max(0.0, self._next_attempt_at - now)
 
-    def _end_attempt(self, opening: LinkOpener) -> None:
-        """Start using a new connection. If the attempt failed, schedule another."""
+    def _finish_connecting(self, opening: LinkOpener) -> None:
+        """Start using the new connection. If it couldn't be opened, schedule another attempt."""
         self._opening = None
         if opening.error is not None:
             self._failed_attempts += 1
@@ -308,7 +311,7 @@ class DeskLink:
         link.publish(Message(self.reply_topic(topics.MARKER), b"\n"), on_acknowledged=self._on_marker_acknowledged)
 
     def _on_marker_acknowledged(self, code: int) -> None:
-        """Store an error if the broker has rejected the marker message."""
+        """Store an error if the broker has rejected the marker, which this link sends to itself."""
         if code >= REASON_FAILURE:
             self.failure = self._rejection_error(code, f"write to {topics.reply(self.user, '+', '+')}")
 

@@ -122,7 +122,7 @@ def reply_outcomes(robot: str, request: Request, reply: JsonObject, items: list[
         items: the list items that the server sent before the reply.
     """
     if isinstance(request, Cancel):
-        return outcomes_of_cancel(robot, items) or [Outcome(robot, "IDLE")]
+        return cancel_outcomes(robot, items) or [Outcome(robot, "IDLE")]
     if isinstance(request, Set):
         return [Outcome(robot, "SET", said={"settings": reply.get("settings")})]
     goal = goal_in(reply)
@@ -141,7 +141,7 @@ def reply_outcomes(robot: str, request: Request, reply: JsonObject, items: list[
     return [Outcome(robot, goal.state.name, (isinstance(request, Say) and goal.exit_code) or EXIT_OK, goal)]
 
 
-def outcomes_of_cancel(robot: str, items: list[JsonObject], *, last: bool = True) -> list[Outcome]:
+def cancel_outcomes(robot: str, items: list[JsonObject], *, last: bool = True) -> list[Outcome]:
     """Return the outcomes of a cancel request, one for each goal.
 
     Args:

@@ -142,16 +142,11 @@ class RobotConnection(Connection):
         self._published_at = time.monotonic()
         self.register(exchange, self._published_at)
 
-    def cancel_permanently(self, goal_id: str, *, is_sent: bool) -> None:
-        """Cancel a goal now, and again whenever the robot comes back.
-
-        Args:
-            goal_id: the id of the goal.
-            is_sent: whether the cancel request has already been sent to the robot's group. Then it isn't sent now.
-        """
+    def cancel_after_absence(self, goal_id: str, *, also_now: bool) -> None:
+        """Cancel a goal after each absence of the robot, and also now if `also_now` is true."""
         with self.changed:
             self._canceled.add(goal_id)
-            if not is_sent:
+            if also_now:
                 self._send_without_answer(Cancel((goal_id,)))
 
     def _send_without_answer(self, request: Request) -> bool:
@@ -190,7 +185,7 @@ class RobotConnection(Connection):
         return float("inf")
 
     def silent_by(self, began: float) -> tuple[float, str]:
-        """Return the time limit for a silent or absent robot, and the error message to use after it."""
+        """Return when a silent or absent robot counts as lost, and the error message for that."""
         if self.absent_since is None:
             return super().silent_by(began)
         return self.absent_since + ABSENCE_LIMIT_S, f"{self.absence} (for {ABSENCE_LIMIT_S:g} s)"
@@ -272,7 +267,7 @@ class RobotConnection(Connection):
     # -- connecting
 
     def wait_online(self, give_up: float) -> None:
-        """Wait until the robot can receive requests, at most until `give_up`.
+        """Wait until the robot can receive requests. Raise an error if it can't by `give_up`.
 
         `give_up` is a monotonic time. The errors are the same as those of `connect_robot`.
         """
@@ -370,7 +365,7 @@ class RobotConnection(Connection):
         self._begin(Exchange(Wait((str(request.id),), request.feedback), on_reply, on_failure), now)
 
     def _begin(self, exchange: Exchange, now: float) -> None:
-        """Queue the lookup of a goal, and send it now unless too many lookups are open."""
+        """Queue a lookup of one or all goals, and send it now unless too many are unanswered."""
         self._lookups.append(exchange)
         self._send_lookups(now)
 

@@ -18,13 +18,13 @@ from talkcli.client.goal import GoalHandle
 from talkcli.errors import EXIT_OK, Lost, ServerUnavailable, TalkError, UnknownGoal, Unreadable, UsageError
 from talkcli.fleet import topics
 from talkcli.fleet.desk.link import DeskLink
-from talkcli.fleet.desk.request import Outcome, Selection, failure_outcome, outcomes_of_cancel, reply_outcomes
+from talkcli.fleet.desk.request import Outcome, Selection, cancel_outcomes, failure_outcome, reply_outcomes
 from talkcli.fleet.desk.robot import RobotConnection, RobotExchange, new_goal_id
 from talkcli.fleet.link import Link, boottime
 from talkcli.fleet.payloads import Message, Presence
 from talkcli.frozen import replace
 from talkcli.goals.goal import Goal, JsonObject
-from talkcli.goals.options import Cancel, Say, Set, check_key
+from talkcli.goals.options import Cancel, Say, Set, key_error
 from talkcli.goals.states import State
 from talkcli.protocol.events import goals
 from talkcli.protocol.lines import FIRST_SEQ
@@ -203,7 +203,7 @@ class FleetRequest:
             # If a robot has left the group, it doesn't receive the message to the group.
             robot = self._robots[name]
             is_sent = group is not None and robot.presence is not None and self._selection.includes(robot.presence)
-            robot.connection.cancel_permanently(goal_id, is_sent=is_sent)
+            robot.connection.cancel_after_absence(goal_id, also_now=not is_sent)
 
     def close(self) -> None:
         """Close the connection to the broker. This doesn't cancel the request."""
@@ -315,7 +315,7 @@ class FleetRequest:
             self._include(name)
             robot.expect_reply(self._number, self._expires_at)
             if self._canceled_id is not None:
-                robot.connection.cancel_permanently(self._canceled_id, is_sent=False)
+                robot.connection.cancel_after_absence(self._canceled_id, also_now=True)
         robot.connection.on_message(message)
         self._update(name)
 
@@ -420,7 +420,7 @@ class RobotRequest:
         """Record that the request failed. First record the goals that it cancelled."""
         try:
             items = error.items if isinstance(error, UnknownGoal) else []
-            self._record(*outcomes_of_cancel(self._name, items, last=False))
+            self._record(*cancel_outcomes(self._name, items, last=False))
         except Unreadable as malformed:
             error = malformed
         self._record(failure_outcome(self._name, error))
@@ -436,7 +436,7 @@ def _check_request(request: Request) -> None:
             raise UsageError("a goal's number is only valid on one server; for several robots, use the goal's whole id")
     if len(batches(ids)) > 1:
         raise UsageError(f"{len(ids):,} ids do not fit into one request; name fewer ids, or none to select all goals")
-    if isinstance(request, Cancel) and request.key is not None and (fault := check_key(request.key)):
+    if isinstance(request, Cancel) and request.key is not None and (fault := key_error(request.key)):
         raise UsageError(fault)
     if isinstance(request, Say | Set):
         check(request)

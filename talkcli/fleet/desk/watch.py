@@ -201,7 +201,9 @@ class FleetWatch:
             self._process_retained(self._retained or [], time.monotonic(), first=True)
             while True:
                 now = time.monotonic()
-                self._handle_due(now)
+                if self._retained is not None and self._desk.retained_received:
+                    self._process_retained(self._retained, now)
+                self._check_time_limits(now)
                 while self._events:
                     yield self._events.popleft()
                 self._desk.poll(_LIMIT_CHECK_INTERVAL_S, interrupt)
@@ -250,10 +252,8 @@ class FleetWatch:
 
     # -- time limits
 
-    def _handle_due(self, now: float) -> None:
-        """Process retained messages, and report missing robots. Raise Lost if the broker can't be reached."""
-        if self._retained is not None and self._desk.retained_received:
-            self._process_retained(self._retained, now)
+    def _check_time_limits(self, now: float) -> None:
+        """Report robots that haven't come back in time. Raise Lost if the broker hasn't."""
         if self._away_since is not None and now - self._away_since >= ABSENCE_LIMIT_S:
             raise Lost(f"the broker at {self._broker.url} was unreachable for {ABSENCE_LIMIT_S:g} s: {self._away_why}")
         for name in [name for name, until in self._missing.items() if now >= until]:
