@@ -399,7 +399,7 @@ class GoalRunner:
             self._step_run_loop()
 
     def _report_word(self, location: int, length: int, **_: object) -> None:
-        """Report the word at a location in the text. Report each word only once.
+        """Tell the server about the word at a location in the text. Report each word only once.
 
         The notification's `name` is not compared with the goal's ID, because some drivers set it to the word.
         """
@@ -489,7 +489,7 @@ def _make_markdown_reader() -> MarkdownReader:
 
 
 def _make_growing_text(text_so_far: str, command: protocol.Speak) -> GrowingText:
-    """Create a GrowingText for a goal.
+    """Return the text of a goal as a `GrowingText`, to which more text can be added.
 
     If the text broke off, an incomplete last sentence is left out.
     """

@@ -141,7 +141,7 @@ class EngineProcess:
             yield event
 
     def read_stderr(self) -> bool:
-        """Report new lines from the process's standard error. Return whether it is still open."""
+        """Read new lines from the process's standard error. Return whether it is still open."""
         try:
             data = os.read(self.stderr, 65536)
         except BlockingIOError:

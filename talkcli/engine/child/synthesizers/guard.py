@@ -86,7 +86,7 @@ _SEPARATE_DIGITS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def guarded(text: str, voice: str = "") -> str:
-    """Replace characters that would crash libespeak-ng.
+    """Replace the parts of a text that would crash libespeak-ng. Return the new text.
 
     The length of the text stays the same.
 
