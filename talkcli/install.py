@@ -35,7 +35,7 @@ class Environment:
 
 
 def command(*packages: str, reinstall: bool = False) -> str:
-    """Return the shell command that installs packages into this process's environment.
+    """Return the shell command that installs the named packages into this process's environment.
 
     Args:
         packages: names of the packages.

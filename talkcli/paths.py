@@ -103,7 +103,7 @@ def sudo_caller(environment: Mapping[str, str]) -> int | None:
 
 
 def sudo_caller_socket() -> str | None:
-    """Return the path of the sudo user's socket, if it exists."""
+    """Return the path of the socket of the user who ran sudo, if it exists."""
     caller = sudo_caller(os.environ)
     if caller is None:
         return None

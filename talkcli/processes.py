@@ -33,7 +33,7 @@ def open_pipes(count: int) -> list[tuple[int, int]]:
 
 
 def close(*descriptors: int) -> None:
-    """Close file descriptors."""
+    """Close the given file descriptors."""
     for each in descriptors:
         os.close(each)
 

@@ -60,7 +60,7 @@ class StateChange:
 
 
 class Order(Enum):
-    """An order to the engine about a goal.
+    """A kind of order to the engine, such as to start or stop a goal.
 
     The value is the order's name in the log.
     """

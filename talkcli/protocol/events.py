@@ -246,7 +246,7 @@ def _event_json(kind: str, event: StateChanged | WordHeard | TextAdded | TextMis
 
 
 def goals(items: list[JsonObject], name: str) -> Iterator[Goal]:
-    """Yield the goals in one field of the list items. Raise Unreadable if a goal is malformed."""
+    """Yield the goal in the field `name` of each list item. Raise Unreadable if one is malformed."""
     return (Goal.from_json(each[name]) for each in items if name in each)
 
 
