@@ -78,7 +78,7 @@ class AddressInUse(TalkError):
 
 
 class ProtocolMismatch(TalkError):
-    """The client and the server use different versions of the protocol, or the server lacks a feature."""
+    """The server uses another version of the protocol, or lacks a feature."""
 
     code = "protocol_mismatch"
     exit_code = 9

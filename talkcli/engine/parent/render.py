@@ -183,10 +183,7 @@ def _convert_engine_error(error: EngineFailed, speaking_voice: str | None) -> Re
 
 
 def _convert_goal_error(ended: protocol.Ended, engine_path: str, shown_path: str) -> RenderFailed:
-    """Return an exception for a goal that failed or was stopped.
-
-    Its message names the user's file.
-    """
+    """Convert an `Ended` to an exception whose message names the file as the user knows it."""
     reason = ended.reason or Reason.ENGINE_FAILED
     message = (ended.message or "the engine stopped before the end of the text").replace(engine_path, shown_path)
     if reason in _FILE_REASONS:

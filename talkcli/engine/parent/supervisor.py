@@ -470,7 +470,7 @@ class Supervisor:
         self._watched |= dict.fromkeys((process.socket.fileno(), process.liveness, process.stderr), process)
 
     def _report_stderr(self, line: str) -> None:
-        """Post a line of a process's standard error. Drop it if there have been too many."""
+        """Post a line of a process's standard error. Drop it if there have been too many lines."""
         omitted = self._stderr_quota.count_event(time.monotonic())
         if omitted:
             self._post(EngineSaid(f"({omitted} lines were omitted)"))

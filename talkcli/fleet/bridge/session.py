@@ -109,7 +109,7 @@ class RemoteSessions:
             session.refuse(request, Busy.code, f"{self.name} already has {MAX_SESSIONS} remote clients")
 
     def handle_goodbye(self, user: str, reply_topic: str) -> None:
-        """Handle a client's goodbye. Its session ends once important requests are answered."""
+        """After a client's goodbye, end its session once requests with a lasting effect are answered."""
         if session := self._sessions.get((user, reply_topic)):
             session.handle_goodbye()
 
@@ -286,10 +286,9 @@ class RemoteSession:
                 self._task = asyncio.create_task(self._run(urgent=urgent))
 
     def handle_goodbye(self) -> None:
-        """Handle the client's goodbye. The session ends once important requests are answered.
+        """After the client's goodbye, end the session once requests with a lasting effect are answered.
 
-        The client gets no more answers, and its waiting goals are dropped. The session stays open until the server has
-        answered requests with a lasting effect.
+        The client gets no more answers, and its waiting goals are dropped.
         """
         self._said_goodbye, self._reply_topic = True, None
         self._drop_waiting()
@@ -337,7 +336,7 @@ class RemoteSession:
         self._sessions.waiting = [each for each in self._sessions.waiting if each[2] is not self]
 
     def _end_if_done(self) -> None:
-        """End the session if its client has left and no important requests are unanswered.
+        """End the session if its client has left and no request with a lasting effect is unanswered.
 
         If `end` was called before the server was connected, close the connection.
         """

@@ -181,7 +181,7 @@ class RobotConnection(Connection):
         return by if self._end is None else min(by, max(self._end, exchange.heard_at))
 
     def goals_lost_at(self) -> float:
-        """Return infinity. Goals are only lost when the whole connection ends."""
+        """Return infinity, because followed goals are only lost when the whole connection ends."""
         return float("inf")
 
     def silent_by(self, began: float) -> tuple[float, str]:
