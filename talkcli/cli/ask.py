@@ -40,7 +40,7 @@ def cancel(options: CommonOptions, ids: tuple[str, ...], current: bool, before: 
             done = client.cancel(ids or None, current=current, before=before, key=key)
             _show_canceled(done, options)
             if key and not done.canceled and not options.quiet and sys.stderr and sys.stderr.isatty():
-                _suggest_key(key, client)
+                _suggest_similar_key(key, client)
         except UnknownGoal as error:
             _show_canceled(Canceled.from_items(error.items), options)
             raise
@@ -201,17 +201,17 @@ def _show_canceled(done: Canceled, options: CommonOptions) -> None:
             note(f"goal {goal.id} had already ended: {goal.state.name}")
 
 
-def _suggest_key(key: str, client: Client) -> None:
-    """Print the most similar key of an unfinished goal as a suggestion, if there is one."""
+def _suggest_similar_key(unknown_key: str, client: Client) -> None:
+    """Print a suggestion if an unfinished goal has a key similar to `unknown_key`."""
     from talkcli.terminal.text import printable
 
     try:
         status = client.status()
     except TalkError:
         return  # the suggestion is optional, so this isn't an error
-    near = nearest(key, {each.key for each in unfinished(status) if each.key})
+    near = nearest(unknown_key, {each.key for each in unfinished(status) if each.key})
     if near:
-        note(f"no goal has the key '{printable(key)}'; did you mean '{printable(near)}'?")
+        note(f"no goal has the key '{printable(unknown_key)}'; did you mean '{printable(near)}'?")
 
 
 def _describe_missing_voice(language: str, voices: Iterable[JsonObject]) -> str:

@@ -120,19 +120,19 @@ def _make_click_argument(argument: Option) -> click.Argument:
     )
 
 
-def _make_completer(completer: str) -> Callable[..., list[CompletionItem]] | None:
-    """Return a function that completes a value for click, if there is a completer."""
+def _make_completer(completer_name: str) -> Callable[..., list[CompletionItem]] | None:
+    """Return a function with which click completes values, or None if the name is empty."""
 
     def complete(context: click.Context, _: click.Parameter, incomplete: str) -> list[CompletionItem]:
         from talkcli.cli import completion
 
-        return completion.complete(completer, context.find_root().obj, incomplete)
+        return completion.complete(completer_name, context.find_root().obj, incomplete)
 
-    return complete if completer else None
+    return complete if completer_name else None
 
 
 def _store_common(context: click.Context, parameter: click.Parameter, value: object) -> None:
-    """Store the value of an option that all commands share."""
+    """Store the value of a common option in the context's CommonOptions."""
     if value:
         setattr(context.ensure_object(CommonOptions), parameter.name or "", value)
 
@@ -168,7 +168,7 @@ class _HelpfulCommand(click.Command):
     def write_options(
         self, heading: str, parameters: Iterable[click.Parameter], ctx: click.Context, formatter: click.HelpFormatter
     ) -> None:
-        """Write the help texts of these options, if there are any."""
+        """Write a section with the help texts of these options, if there are any."""
         records = [each.get_help_record(ctx) for each in parameters if isinstance(each, click.Option)]
         if records:
             with formatter.section(heading):
@@ -202,7 +202,7 @@ class ClickCommand(_HelpfulCommand):
         formatter.write("\nCommon options and exit codes: talk --help\n")
 
     def _run(self, **given: Any) -> int | None:
-        """Run the command. Return its exit code.
+        """Check the options, and run the command. Return its exit code, if any.
 
         Raise a click.UsageError if its options can't be combined.
         """
@@ -230,7 +230,7 @@ class ClickCommand(_HelpfulCommand):
 
 
 class _CommandGroup(_HelpfulCommand, click.Group):
-    """The group of all commands. Each command is created when it is first used."""
+    """The group of all commands. Each command is created only when it is needed."""
 
     examples, exit_codes = _EXAMPLES, ALL_EXIT_CODES
 
@@ -273,10 +273,10 @@ class _CommandGroup(_HelpfulCommand, click.Group):
 def talk(context: click.Context) -> None:
     """Print an overview if no command is given."""
     if context.invoked_subcommand is None:
-        click.echo(_first_screen(context))
+        click.echo(_format_overview(context))
 
 
-def _first_screen(context: click.Context) -> str:
+def _format_overview(context: click.Context) -> str:
     """Return the overview to print if `talk` is run without a command.
 
     It leaves room for the next shell prompt on a terminal with 24 lines.
@@ -301,9 +301,9 @@ def run(arguments: list[str]) -> int:
 
 
 def _run_group(arguments: list[str], options: CommonOptions) -> object:
-    """Run a command line with click. Return its result.
+    """Run a command line with click. Return its result, or the exit code after an error.
 
-    Report click's errors, and return their exit codes.
+    Report click's errors.
     """
     try:
         with talk.make_context("talk", [*arguments], obj=options) as context:

@@ -84,62 +84,62 @@ class Command:
     #: the exit codes to show in the help, with their meanings
     exit_codes: ExitCodes | None = None
 
-    def usage_fault(self, given: Mapping[str, Any], typed: frozenset[str], common: Mapping[str, Any]) -> str | None:
+    def usage_fault(self, values: Mapping[str, Any], typed: frozenset[str], common: Mapping[str, Any]) -> str | None:
         """Return an error message if the options are invalid or can't be combined.
 
         Args:
-            given: the values of the command's own options and of its argument, by name.
+            values: the values of the command's own options and of its argument, by name.
             typed: the names of the options on the command line.
             common: the values of the common options on the command line, by name.
         """
         robot, socket, connect_timeout = (common.get(each) for each in ("robot", "socket", "connect_timeout"))
         if robot is not None and socket:
             return "--robot and --socket can't be combined; leave out one of them"
-        is_local = self._is_local(given)
-        local_name = f"{self.name}{' --output' * (given.get('output') is not None)}"
+        is_local = self._runs_without_server(values)
+        local_name = f"{self.name}{' --output' * (values.get('output') is not None)}"
         if is_local and robot is not None:
             return f"'talk {local_name}' only works on this machine; leave out --robot"
         if connect_timeout is not None and (is_local or not self.connects):
             return f"'talk {local_name}' does not wait for a server; leave out --connect-timeout"
         robot = None if is_local else named_robot(robot, socket)
-        if robot and (fault := self._robot_fault(robot, given, connect_timeout)):
+        if robot and (fault := self._robot_fault(robot, values, connect_timeout)):
             return fault
         for each in self.options:
-            if fault := each.value_error(given[each.name]):
+            if fault := each.value_error(values[each.name]):
                 return fault
-        return self.rule(given, typed) if self.rule else None
+        return self.rule(values, typed) if self.rule else None
 
-    def _is_local(self, given: Mapping[str, Any]) -> bool:
+    def _runs_without_server(self, values: Mapping[str, Any]) -> bool:
         """Return whether the command runs without a server, as `talk say --output` does."""
-        return not self.uses_server or given.get("output") is not None
+        return not self.uses_server or values.get("output") is not None
 
-    def _robot_fault(self, robot: str, given: Mapping[str, Any], connect_timeout: float | None) -> str | None:
+    def _robot_fault(self, selection: str, values: Mapping[str, Any], connect_timeout: float | None) -> str | None:
         """Return an error message if the command can't be sent to the selected robots."""
         from talkcli.fleet.desk.request import Selection, selects_several
 
-        if selects_several(robot):
-            single = [f"--{each}" for each in _SINGLE_ROBOT_OPTIONS if given.get(each)]
+        if selects_several(selection):
+            single = [f"--{each}" for each in _SINGLE_ROBOT_OPTIONS if values.get(each)]
             if single or not self.fleet_function:
                 what = " ".join([self.name, *single])
                 return f"'talk {what}' only works with one robot; name it, or try 'talk fleet status' for several"
             if connect_timeout is not None:
                 return "--connect-timeout only works with one robot; name it, or leave out --connect-timeout"
-        return Selection(robot).fault
+        return Selection(selection).fault
 
-    def run(self, options: CommonOptions, given: Mapping[str, Any]) -> int | None:
+    def run(self, options: CommonOptions, values: Mapping[str, Any]) -> int | None:
         """Run the command on this machine or on robots. Return its exit code, if any."""
         options.urgent = self.urgent
         function = self.function or f"ask:{self.name}"
-        robot = None if self._is_local(given) else named_robot(options.robot, options.socket)
+        robot = None if self._runs_without_server(values) else named_robot(options.robot, options.socket)
         if robot:
             from talkcli.fleet.desk.request import selects_several
 
             if selects_several(robot):
                 function = self.fleet_function
-                given = {name: value for name, value in given.items() if name not in _SINGLE_ROBOT_OPTIONS}
+                values = {name: value for name, value in values.items() if name not in _SINGLE_ROBOT_OPTIONS}
         module, _, name = function.partition(":")
         run: Callable[..., int | None] = getattr(__import__(f"talkcli.cli.{module}", fromlist=[name]), name)
-        return run(options, **given)
+        return run(options, **values)
 
 
 def option(flags: str, kind: Kind, help_text: str, **more: Any) -> Option:
@@ -193,10 +193,9 @@ def long_flag(option: Option, value: object = None) -> str:
 
 
 def read_value(option: Option, text: str) -> Any:
-    """Parse and check the value of an option.
+    """Convert the text of an option to its value. Raise ValueError if it is invalid.
 
-    Raises:
-        ValueError: the text isn't a valid value. The message says why.
+    The error message says why.
     """
     kind = option.kind
     if kind in (INTEGER, NUMBER, SECONDS):

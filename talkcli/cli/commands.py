@@ -57,39 +57,39 @@ _SERVERLESS_OPTIONS = {"timeout", "output", "format", *(each.name for each in go
 _OTHER_EXTENSIONS = (".aac", ".aiff", ".au", ".flac", ".m4a", ".mp3", ".mp4", ".oga", ".ogg", ".opus", ".webm", ".wma")
 
 
-def _say_fault(given: Mapping[str, Any], typed: frozenset[str]) -> str | None:
+def _say_fault(values: Mapping[str, Any], typed: frozenset[str]) -> str | None:
     """Return an error message if options of `say` can't be combined."""
-    output, waits = given["output"], given["wait"] or given["feedback"]
+    output, waits = values["output"], values["wait"] or values["feedback"]
     if output is not None:
-        named = [long_flag(each, given[each.name]) for each in _SAY_OPTIONS if each.name in typed - _SERVERLESS_OPTIONS]
-        if named:
-            return f"--output writes a file without a server; leave out {', '.join(named)}"
+        bad = [long_flag(each, values[each.name]) for each in _SAY_OPTIONS if each.name in typed - _SERVERLESS_OPTIONS]
+        if bad:
+            return f"--output writes a file without a server; leave out {', '.join(bad)}"
         extension = os.path.splitext(output)[1]
         if extension.lower() in _OTHER_EXTENSIONS:
             return "--output can only write WAV files; name the file .wav, and convert it with ffmpeg or sox"
-    if fault := _input_fault(given, typed):
+    if fault := _input_fault(values, typed):
         return fault
-    if given["flush"] and given["preempt"] is False:
+    if values["flush"] and values["preempt"] is False:
         return "--flush and --queue can't be combined; leave out one of them"
-    if given["timeout"] is not None and not waits and output is None:
+    if values["timeout"] is not None and not waits and output is None:
         return "--timeout only works with --wait; add --wait, or leave out --timeout"
     return None
 
 
-def _input_fault(given: Mapping[str, Any], typed: frozenset[str]) -> str | None:
+def _input_fault(values: Mapping[str, Any], typed: frozenset[str]) -> str | None:
     """Return an error message if TEXT can't be combined with the options that read standard input."""
-    text = given["text"]
-    if given["stream"] and (given["lines"] or text not in {(), ("-",)}):
+    text = values["text"]
+    if values["stream"] and (values["lines"] or text not in {(), ("-",)}):
         return "--stream speaks standard input as one text; leave out TEXT and --lines"
-    if "stall" in typed and not given["stream"]:
+    if "stall" in typed and not values["stream"]:
         return "--stall only works with --stream; add --stream, or leave out --stall"
-    if given["lines"] and text:
+    if values["lines"] and text:
         return "--lines reads standard input; leave out TEXT"
-    if given["lines"] and given["id"] is not None:
+    if values["lines"] and values["id"] is not None:
         return "--lines speaks many lines, but --id can only name one goal; leave out one of them"
-    if given["ahead"] is not None and not given["lines"]:
+    if values["ahead"] is not None and not values["lines"]:
         return "--ahead only works with --lines; add --lines, or leave out --ahead"
-    if not (given["lines"] or given["stream"] or text):
+    if not (values["lines"] or values["stream"] or text):
         return "TEXT is missing; type the sentence, or '-' to read standard input"
     return None
 
@@ -151,19 +151,19 @@ _SERVE_OPTIONS = (
 )
 
 
-def _serve_fault(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
+def _serve_fault(values: Mapping[str, Any], _: frozenset[str]) -> str | None:
     """Return an error message if options of `serve` can't be combined."""
-    player = given["player"] or ""
-    if given["device"] and player.startswith(("null", "file:")):
+    player = values["player"] or ""
+    if values["device"] and player.startswith(("null", "file:")):
         return f"the player {player} has no devices; leave out --device"
     if player == "file:":
         return "--player file: needs a path, as in file:PATH.wav"
     return None
 
 
-def _bridge_fault(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
+def _bridge_fault(values: Mapping[str, Any], _: frozenset[str]) -> str | None:
     """Return an error message if `bridge` lacks a required --name."""
-    if given["name"] is None and not given["print_acl"]:
+    if values["name"] is None and not values["print_acl"]:
         return "--name is missing; choose the robot's name on the broker, as in: talk bridge --name anna"
     return None
 

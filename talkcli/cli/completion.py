@@ -149,22 +149,22 @@ def _quote_for_bash(value: str, open_quote: str) -> str:
     return _BASH_SPECIAL.sub(lambda found: f"\\{found[0]}", value)
 
 
-def complete(completer: str, options: CommonOptions, incomplete: str) -> list[CompletionItem[str]]:
+def complete(completer_name: str, options: CommonOptions, incomplete: str) -> list[CompletionItem[str]]:
     """Return the completions for a partially typed word.
 
     Args:
-        completer: the name of the completer, or "files" to let the shell complete file names.
+        completer_name: the name of a function in this module, or "files" to let the shell complete file names.
         options: the common options that were typed before the word.
         incomplete: the part of the word that has been typed.
 
     Returns:
         The matching values, without duplicates. The list is empty after an error, for example if there is no server.
     """
-    if completer == "files":
+    if completer_name == "files":
         return [CompletionItem(incomplete, type="file")]
     options.connect_timeout = None
     try:
-        offers: Offers = globals()[completer](options, incomplete)
+        offers: Offers = globals()[completer_name](options, incomplete)
     except (TalkError, OSError, ValueError):
         return []
     matching: dict[str, str] = {}
@@ -205,10 +205,9 @@ def unfinished_keys(options: CommonOptions, _: str) -> Offers:
 
 
 def voices(options: CommonOptions, incomplete: str) -> Offers:
-    """Return the languages of the voices as completions.
+    """Return languages as completions for a voice or, if none match, voice ids or names.
 
-    If no language matches, return voice ids or names. Neural voices are always offered by id, because there are few of
-    them and users select them by id.
+    Neural voices are always offered by id, because there are few of them and users select them by id.
     """
     with options.connect(COMPLETION_TIMEOUT_S) as client:
         found = client.voices()
@@ -222,7 +221,7 @@ def voices(options: CommonOptions, incomplete: str) -> Offers:
 
 
 def robots(options: CommonOptions, _: str) -> Offers:
-    """Complete the names and groups of online robots."""
+    """Return the names and groups of online robots as completions."""
     broker = options.broker()
     from talkcli.fleet import topics
     from talkcli.fleet.desk.watch import read_robots

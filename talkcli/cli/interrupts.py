@@ -101,9 +101,9 @@ class Interrupts:
         return kind is Interrupted
 
     def handle_error(self, error: Interrupted | OSError) -> None:
-        """Handle an interrupt, a timeout or a missing reader. Raise any other error.
+        """Discard the output if its reader is gone. Raise an unexpected error again.
 
-        Record in `reader_gone` whether the output's reader is gone. If it is, discard all output.
+        Interrupts, timeouts and a missing reader are expected. Record in `reader_gone` whether the reader is gone.
         """
         if isinstance(error, Interrupted | TimeoutError):
             self.reader_gone = STDOUT_FD in self.watched and not has_reader()
@@ -115,7 +115,7 @@ class Interrupts:
             discard_output()
 
     def prepare_cleanup(self) -> None:
-        """Clear the interrupt. After this, only a new signal interrupts the cleanup."""
+        """Clear the interrupt before a cleanup, which only a new signal can interrupt."""
         if self.signal_number is not None:
             signal.set_wakeup_fd(-1)  # a second SIGHUP must not interrupt the cleanup
         self.watched.pop(STDOUT_FD, None)

@@ -51,7 +51,7 @@ class PlainCommand:
 
 
 def read(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand | None:
-    """Parse a command line. Return None if click has to parse it."""
+    """Parse a simple command line. Return None if click has to parse it."""
     try:
         return _parse(arguments, environment)
     except (LookupError, ValueError, StopIteration):  # an option is unknown, or its value is invalid or missing
@@ -59,7 +59,7 @@ def read(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand |
 
 
 def _parse(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand | None:
-    """Parse a command line without click. Return None or raise an error if that fails."""
+    """Parse a simple command line. Return None or raise an error if click has to parse it."""
     command: Command | None = None
     words: list[str] = []
     given: dict[str, Any] = {}
@@ -105,10 +105,7 @@ def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, 
 def _build_command(
     command: Command, given: dict[str, Any], words: list[str], environment: Mapping[str, str]
 ) -> PlainCommand | None:
-    """Add defaults, and check the options. Return the complete command.
-
-    Return None if click has to parse the command line.
-    """
+    """Add defaults, and check the options. Return None if click has to parse the command line."""
     common = {name: given.pop(name) for name in _COMMON_NAMES & given.keys()}
     typed = frozenset(given)
     for option in command.options:
@@ -164,7 +161,7 @@ def may_send_early(parsed: PlainCommand) -> bool:
 
 
 def _connect_early(parsed: PlainCommand, before_sending: Callable[[], None]) -> ConnectionAttempt | None:
-    """Connect to the server, and send a simple request. Return the connection attempt.
+    """Connect to the server, and send the request if it is simple. Return the connection attempt.
 
     Args:
         parsed: the command.

@@ -62,7 +62,7 @@ def say(
 
 
 def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None) -> int:
-    """Wait on each robot until the given goals, or all goals, have ended.
+    """Wait until the given goals, or all goals, have ended on each robot. Print the outcomes.
 
     Return the exit code.
     """
@@ -71,7 +71,7 @@ def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None) ->
 
 
 def cancel(options: CommonOptions, ids: tuple[str, ...], current: bool, before: str | None, key: str | None) -> int:
-    """Cancel the selected goals, or all goals, on each robot."""
+    """Cancel the selected goals, or all goals, on each robot. Print the outcomes."""
     return _send_request(options, Cancel(ids or None, current, before, key))
 
 
@@ -92,12 +92,12 @@ def change(options: CommonOptions, **settings: Any) -> int:
 
 
 def pause(options: CommonOptions) -> int:
-    """Pause speech on each robot."""
+    """Pause speech on each robot, and print the outcomes."""
     return _send_request(options, Pause())
 
 
 def resume(options: CommonOptions) -> int:
-    """Resume paused speech on each robot."""
+    """Resume paused speech on each robot, and print the outcomes."""
     return _send_request(options, Resume())
 
 
@@ -142,7 +142,7 @@ def _send_request(
 
 
 def _cancel_goals(fleet_request: FleetRequest, interrupts: Interrupts, printer: _OutcomePrinter) -> None:
-    """Cancel a request's unfinished goals, and wait briefly for the outcomes."""
+    """Cancel a request's unfinished goals, wait briefly for the outcomes, and print them."""
     interrupts.prepare_cleanup()
     try:
         if fleet_request.unfinished_robots:
@@ -180,9 +180,9 @@ class _OutcomePrinter:
             self._clear_count()
 
     def _record_outcome(self, outcome: Outcome) -> None:
-        """Store a robot's outcome. Keep the first failure.
+        """Record a robot's outcome, unless a failure of this robot has already been recorded.
 
-        An earlier failure is only replaced if it seemed to be final.
+        A failure that seemed to be final is replaced.
         """
         before = self._outcomes.get(outcome.robot)
         # A robot that answers after a final failure wasn't absent after all, so replace that failure.

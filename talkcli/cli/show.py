@@ -180,12 +180,9 @@ def reader_is_gone(error: OSError) -> bool:
 
 
 def handle_output_error(error: Exception) -> int | None:
-    """Discard further output after a failed write to standard output. Return the exit code.
+    """Discard output after a failed write. Return the exit code, or None for other errors.
 
     A full or broken disk is reported.
-
-    Returns:
-        The exit code, or None if the error doesn't concern standard output.
     """
     global _output_lost  # noqa: PLW0603 - a process has only one standard output
     if not isinstance(error, OSError):
@@ -390,7 +387,7 @@ def has_colour() -> bool:
 
 
 def screen(*, long: bool = False, boot: str = "") -> Screen:
-    """Return a Screen that describes standard output."""
+    """Return a Screen with the width and colours of standard output."""
     from talkcli.terminal.text import Screen
 
     if sys.stdout is None or not sys.stdout.isatty():

@@ -235,8 +235,8 @@ class InputSpeaker:
         """
         raise NotImplementedError
 
-    def _await_input(self, wait: Callable[[], object], *, wants_input: bool) -> bytes | None:
-        """Call a blocking function. Return the input that interrupted it, if any.
+    def _wait_unless_input(self, wait: Callable[[], object], *, wants_input: bool) -> bytes | None:
+        """Call a function that blocks, and interrupt it if input arrives. Return the input, or None.
 
         Args:
             wait: the function.
@@ -476,7 +476,7 @@ class LineSpeaker(InputSpeaker):
         wait = partial(self._connection.wait_until, has_news, since=since)
         idle = not (self._unanswered or self._goals)
         pause = partial(wait_ready, {}, seconds_left(end), self._interrupts.watched) if idle else partial(wait, end)
-        data = self._await_input(pause, wants_input=self._wants_input)
+        data = self._wait_unless_input(pause, wants_input=self._wants_input)
         if data is not None:
             self._buffer.feed(data, time.monotonic())
             if not idle:  # read from the server even if there is always more input
@@ -503,7 +503,7 @@ class LineSpeaker(InputSpeaker):
     # Stopping before the end of the input
 
     def _stop_early(self) -> None:
-        """Report the first unsent line. With --wait, cancel the goals first."""
+        """Report the first unsent line. With --wait, close the connection and cancel the goals first."""
         if self._wait:
             # Close the connection first. Otherwise, a line that is waiting for room in the queue would be accepted when
             # the other goals are cancelled.

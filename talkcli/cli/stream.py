@@ -70,7 +70,7 @@ class StreamSpeaker(InputSpeaker):
         self._text = self._speech._text
         while not (request := self._text.request_to_send()):
             pause = partial(wait_ready, {}, seconds_left(self._end), self._interrupts.watched)
-            self._add_input(self._await_input(pause, wants_input=True))
+            self._add_input(self._wait_unless_input(pause, wants_input=True))
             if seconds_left(self._end) == 0:
                 raise timeout_error(self._timeout, "nothing was sent")
         assert isinstance(request, Say)
@@ -84,9 +84,7 @@ class StreamSpeaker(InputSpeaker):
         return retry_without_output(reporter.report, goal.goal)
 
     def _follow(self, goal: GoalHandle) -> None:
-        """Send the input as it arrives, until it ends.
-
-        With --wait, also show the goal's events until the goal ends.
+        """Send the input as it arrives. With --wait, show the goal's events until the goal ends.
 
         Raises:
             TimeoutError: the goal has not ended in time.
@@ -102,7 +100,7 @@ class StreamSpeaker(InputSpeaker):
                 exchange = self._connection.begin(request, self._speech._add_text)
             pause = partial(self._connection.wait_until, partial(_has_news, goal, exchange), self._end)
             wants_input = can_write and exchange is None and not self._text.ended
-            self._add_input(self._await_input(pause, wants_input=wants_input))
+            self._add_input(self._wait_unless_input(pause, wants_input=wants_input))
             if exchange and exchange.over:
                 self._process_answer(exchange)
                 exchange = None
@@ -123,10 +121,7 @@ class StreamSpeaker(InputSpeaker):
         self._text.ended = not data
 
     def _process_answer(self, exchange: Exchange) -> None:
-        """Process the answer to a request to add text.
-
-        If the server refused only this text, report that, and stop the goal.
-        """
+        """Process the answer to a request to add text. If only this text was refused, stop the goal."""
         try:
             self._connection.answer(exchange)
         except TalkError as error:

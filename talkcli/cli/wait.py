@@ -91,11 +91,11 @@ class GoalReporter:
             show_if_possible(self.feedback.show, goal, Result(goal))
         return self.report(goal, prefix)
 
-    def report(self, goal: Goal, prefix: str = "", own_cancel: bool = False) -> int:
-        """Print a goal as JSON, or the reason why it failed. Return its exit code.
+    def report(self, goal: Goal, prefix: str = "", cancelled_here: bool = False) -> int:
+        """Print why a goal failed, if it did. With --json, also print the goal. Return its exit code.
 
         The exit code of an unfinished goal is 0. `prefix` is put in front of any message. If this command has cancelled
-        the goal (`own_cancel`), the message doesn't name it.
+        the goal (`cancelled_here`), the message doesn't name it.
         """
         if self._options.json and not self.feedback.shows_events:
             show_if_possible(show_json, goal.to_json())
@@ -103,7 +103,7 @@ class GoalReporter:
         if goal.state.terminal and (muted or goal.state is not State.SUCCEEDED) and not self._options.quiet:
             from talkcli.terminal.goals import describe_end
 
-            words = describe_end(goal, name_client=not own_cancel)
+            words = describe_end(goal, name_client=not cancelled_here)
             # The doctor can't find out why the text is unsuitable or incomplete.
             if goal.state is State.ABORTED and goal.reason not in {"nothing_to_say", "text_stalled", "broken_off"}:
                 words += "; find out why with: talk doctor"

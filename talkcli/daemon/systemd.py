@@ -101,7 +101,7 @@ class ServiceManager:
         self._timers[name] = self._loop.call_later(seconds, act)
 
     def _send(self, **fields: str) -> None:
-        """Send fields to the service manager. Retry later if this fails.
+        """Send these fields to the service manager. Retry later if this fails.
 
         Fields from failed attempts are sent again.
         """

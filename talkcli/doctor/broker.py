@@ -137,7 +137,7 @@ class BrokerExamination:
         """Connect to the broker, and check its certificate. Yield the findings."""
         began = time.monotonic()
         try:
-            connection = self._wait_for(partial(socket.create_connection, (broker.host, broker.port), LOGIN_LIMIT_S))
+            connection = self._run_limited(partial(socket.create_connection, (broker.host, broker.port), LOGIN_LIMIT_S))
         except (OSError, UnicodeError) as error:  # UnicodeError means that the host name is invalid
             yield judge_unreachable(broker, _explain_error(error))
             return
@@ -146,7 +146,7 @@ class BrokerExamination:
         with connection:
             if context is not None:
                 try:
-                    expires_at = self._wait_for(partial(_read_expiry, connection, context, broker.host))
+                    expires_at = self._run_limited(partial(_read_expiry, connection, context, broker.host))
                 except OSError as error:
                     code = error.verify_code if isinstance(error, ssl.SSLCertVerificationError) else 0
                     yield judge_tls_error(broker, _explain_error(error), code, time.time())
@@ -162,7 +162,7 @@ class BrokerExamination:
         name = f"talk-doctor-{os.urandom(8).hex()}"
         link = Link(broker, name, self._inbox.append, receive_maximum=MAX_RECEIVE_COUNT)
         try:
-            self._wait_for(link.open)
+            self._run_limited(link.open)
         except TimeoutError as error:
             raise ServerUnavailable(f"the broker at {broker.url} did not answer within {_STEP_LIMIT_S:g} s") from error
         return link
@@ -239,8 +239,8 @@ class BrokerExamination:
             step = f"read the bridge's log on {self._robot}: journalctl -u talk-bridge"
             return failure("bridge", wrong, remedy or step)
 
-    def _wait_for(self, function: Callable[[], _Result]) -> _Result:
-        """Run a blocking function in a thread. Return its result.
+    def _run_limited(self, function: Callable[[], _Result]) -> _Result:
+        """Run a blocking function in a thread, with a time limit. Return its result.
 
         Raises:
             TimeoutError: The work takes too long. The thread continues, but its result is ignored.

@@ -43,7 +43,7 @@ class Finding:
 
 @frozen
 class Question:
-    """The two possible answers of the doctor: one if all checks passed, one if a check failed."""
+    """The two answers to the doctor's question: `yes` if all checks passed, `no` if one failed."""
 
     #: the human-readable answers
     yes: str

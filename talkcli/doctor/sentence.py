@@ -192,7 +192,7 @@ def find_playback_step(findings: Sequence[Finding], *, custom_player: bool = Fal
 def advise(
     reason: str | None, message: str | None, player: object = None, device: object = None, text: str | None = None
 ) -> str:
-    """Return advice for a goal, based on its reason and message.
+    """Return advice on a failed goal, based on the goal's reason and message.
 
     Args:
         reason: the goal's reason.
