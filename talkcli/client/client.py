@@ -131,9 +131,9 @@ class Client:
         patient: bool = False,
         block: bool = True,
     ) -> GoalHandle:
-        """Send a goal. Return its handle.
+        """Send a text to be spoken. Return the handle of its goal.
 
-        With `block`, wait until the server has accepted or REJECTED it.
+        With `block`, wait until the server has accepted or REJECTED the goal.
 
         Args:
             text: the text to speak, up to 10,000 characters.
@@ -428,7 +428,7 @@ class Client:
     # -- internal
 
     def _create_handle(self, request: Say) -> tuple[GoalHandle, OnReply]:
-        """Check a new goal. Return its handle and a function for the server's reply.
+        """Check a `say` request. Return its goal's handle, and the function to call with the reply.
 
         If the text is too long for a request, the goal is already REJECTED.
 
@@ -484,7 +484,7 @@ def check_id(goal_id: str) -> None:
 
 
 def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
-    """Remove duplicate ids. Return the others in groups that fit into one request."""
+    """Return the ids without duplicates, in groups that each fit into one request."""
     groups: list[list[str]] = []
     room = 0
     for each in dict.fromkeys(ids):

@@ -256,7 +256,7 @@ def _server_may_start(attempt: ConnectionAttempt) -> bool:
 def _greet(
     attempt: ConnectionAttempt, hello: JsonObject, deadline: float, interrupt: Mapping[int, int] | None
 ) -> ConnectionAttempt:
-    """Send hello if necessary, and read the server's greeting. Return the updated attempt.
+    """Send the hello message if necessary, and read the server's greeting. Return the updated attempt.
 
     The connection is closed if the greeting has not arrived by `deadline` (monotonic), and after any other error.
 

@@ -49,7 +49,7 @@ def checked_sender_name(name: str | None) -> str | None:
 
 
 def take_repeatedly(connection: Connection, take: Callable[[], _T], deadline: float | None) -> Iterator[_T]:
-    """Yield the results of `take` without end. Wait for the server when there are none.
+    """Call `take` again and again, and yield its results. Wait for the server if there are none.
 
     An empty result is yielded if `deadline` has passed or the connection has ended. Nothing more is received after
     `deadline`, so that a loop over the results ends even if the server keeps sending events.
@@ -130,7 +130,7 @@ class Connection(ClientCore):
             self.changed.notify_all()
 
     def request(self, request: Request, on_reply: OnReply | None = None) -> tuple[JsonObject, list[JsonObject]]:
-        """Send a request. Return the reply and the items of its list.
+        """Send a request, and wait for the answer. Return the reply and the items of its list.
 
         Args:
             request: the request.
@@ -229,7 +229,7 @@ class Connection(ClientCore):
                     return True
                 if self.ended is not None:
                     return False
-                silent_at, why = self.silent_by(began)
+                silent_at, why = self.silence_deadline(began)
                 if late and now >= min(deadline, silent_at):
                     if deadline <= silent_at:
                         return False
@@ -259,7 +259,7 @@ class Connection(ClientCore):
             self.wait_until(lambda: False, time.monotonic(), interruptible=False)
 
     def _cut_off(self) -> None:
-        """Break a connection on which only part of a line was sent.
+        """Break off the connection after only part of a request was sent.
 
         The caller must hold the lock `changed`.
         """
@@ -290,7 +290,7 @@ class Connection(ClientCore):
         raise NotImplementedError
 
     def _drop(self) -> None:
-        """Close the descriptors in this process.
+        """Close the connection's descriptors in this process.
 
         A parent process keeps its own copies.
         """

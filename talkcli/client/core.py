@@ -118,12 +118,12 @@ class EventListeners:
         #: the buffers of the readers that watch all goals. A reader stops watching by dropping its buffer.
         self.watches: WeakSet[EventBuffer] = WeakSet()
 
-    def add(self, tracked: TrackedGoal) -> None:
-        """Start passing a goal's events and all pauses to `tracked`.
+    def add(self, tracked_goal: TrackedGoal) -> None:
+        """Start passing a goal's events, and all pause events, to `tracked_goal`.
 
         This ends when the goal has ended or is lost.
         """
-        self._goals.setdefault(tracked.goal.id, set()).add(tracked)
+        self._goals.setdefault(tracked_goal.goal.id, set()).add(tracked_goal)
 
     @property
     def goals(self) -> dict[str, bool]:
@@ -222,7 +222,7 @@ class TrackedGoal:
             listeners.add(self)
 
     def _grow(self, addition: Append) -> None:
-        """Add text that the server has accepted, unless the goal has ended.
+        """Record text that the server has added to the goal, unless the goal has ended.
 
         After reconnecting, the goal may already have this text. The Result has the whole text.
         """
@@ -420,7 +420,7 @@ class ClientCore:
     # -- requests
 
     def register(self, exchange: Exchange, now: float) -> None:
-        """Give an exchange a number, and start waiting for its answer."""
+        """Give an exchange a number, and add it to the unanswered exchanges."""
         exchange.number = exchange.number or next(self._numbers)
         exchange.heard_at = now
         self.exchanges[exchange.number] = exchange
@@ -430,7 +430,7 @@ class ClientCore:
         return request_line({"seq": exchange.number, **request_to_json(exchange.request)})
 
     def queue(self, line: bytes, exchange: Exchange) -> None:
-        """Queue the line that contains an exchange's request.
+        """Queue the line with an exchange's request for sending.
 
         Raises:
             ServerUnavailable: nothing more can be sent.
@@ -561,15 +561,15 @@ class ClientCore:
         ttl = exchange.request.ttl if isinstance(exchange.request, Say) else None
         return exchange.heard_at + min(self._patience, ttl or self._patience)
 
-    def silent_by(self, began: float) -> tuple[float, str]:
-        """Return the time limit for a silent server, and the message to report.
+    def silence_deadline(self, waiting_since: float) -> tuple[float, str]:
+        """Return when a silent server counts as lost, and the error message for that.
 
         Args:
-            began: when the caller started to wait (monotonic). Earlier silence doesn't count.
+            waiting_since: when the caller started to wait (monotonic). Earlier silence doesn't count.
         """
         if self.absent_since is not None:
             return float("inf"), ""
-        return max(began, self._heard) + SILENCE_LIMIT_S, f"the server sent nothing for {SILENCE_LIMIT_S:g} s"
+        return max(waiting_since, self._heard) + SILENCE_LIMIT_S, f"the server sent nothing for {SILENCE_LIMIT_S:g} s"
 
     def goals_lost_at(self) -> float:
         """Return the time at which followed goals become LOST.
@@ -589,9 +589,9 @@ class ClientCore:
         return min(times, default=float("inf"))
 
     def expire(self, now: float) -> bool:
-        """Enforce the time limits. Return False if the connection must be closed.
+        """Fail late requests, and give up lost goals. Return False if the connection must be closed.
 
-        Late requests fail. Followed goals are LOST if the client was disconnected for too long.
+        Followed goals are LOST if the client was disconnected for too long.
 
         Returns:
             False if the connection must be closed, because a part of a line has been sent (see `forget`).
@@ -615,7 +615,7 @@ class ClientCore:
         return self._splitter.feed(data)
 
     def begin_stream(self) -> None:
-        """Discard the incomplete line of the previous stream."""
+        """Prepare for a new stream of bytes. Discard the incomplete line of the previous one."""
         self._splitter = LineSplitter()
 
     def receive(self, data: bytes, now: float) -> None:
@@ -687,10 +687,7 @@ class ClientCore:
     # -- disconnecting and reconnecting
 
     def break_off(self, why: str, now: float) -> None:  # noqa: ARG002 - for subclasses that reconnect
-        """End the connection for good.
-
-        Subclasses may reconnect instead.
-        """
+        """End a faulty connection for good. Subclasses may reconnect instead."""
         self.end(why)
 
     def end(self, why: str) -> None:

@@ -180,7 +180,7 @@ class GoalHandle(TrackedGoal):
                 yield event
 
     def _follow(self, *, feedback: bool) -> None:
-        """Ask the server to send the goal's events, if necessary."""
+        """Ask the server for the goal's events, unless it already sends them."""
         if self.state.terminal or (self._followed_at is not None and (self._with_feedback or not feedback)):
             return
 
@@ -191,7 +191,7 @@ class GoalHandle(TrackedGoal):
         self._connection.request(Wait((self.id,), feedback), accepted)
 
     def _give_up(self, timeout: float | None) -> None:
-        """End the goal as LOST if the connection has ended, or raise TimeoutError."""
+        """End the goal as LOST if the connection has ended. Otherwise, raise TimeoutError."""
         if not self._lose_if_disconnected():
             raise TimeoutError(f"goal {self.id} has not ended after {0 if timeout is None else round(timeout, 1):g} s")
 
@@ -205,7 +205,7 @@ class GoalHandle(TrackedGoal):
 
 
 def merged(handles: Sequence[GoalHandle], timeout: float | None = None) -> Iterator[tuple[GoalHandle, Event]]:
-    """Yield the events of several goals until all of them have ended. Each comes with its goal's handle.
+    """Yield each event of several goals with its goal's handle, until all of them have ended.
 
     The last event of each goal is its Result. A pause of all speech is yielded only once. If the connection ends, the
     remaining goals end as LOST.

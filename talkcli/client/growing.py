@@ -11,7 +11,7 @@ from talkcli.goals.options import MAX_TEXT_CHARS, Append, Say, is_visible
 
 
 class TextSender:
-    """Sends a growing text to the server, one request at a time."""
+    """Creates the requests that send a growing text, one at a time."""
 
     def __init__(self, say: Say) -> None:
         """Start with an empty text.

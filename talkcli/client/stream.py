@@ -134,13 +134,13 @@ class SpeechStream:
         self.goal._grow(addition)
 
     def _break_off(self) -> None:
-        """Stop a goal whose text will never be complete."""
+        """Ask the server to stop the goal, because its text will never be complete."""
         assert self.goal
         with suppress(TalkError):
             self._connection.request(Append(self.goal.id, broken=True))
 
     def _process_error(self, error: TalkError) -> bool:
-        """Handle an error while adding text. Return whether the goal accepts other text."""
+        """Record that text could not be added. Return whether the goal accepts other text."""
         assert self.goal
         if isinstance(error, RequestRefused) and error.code == "goal_ended":
             self._refused = True

@@ -340,9 +340,9 @@ def test_each_line_of_an_answer_extends_its_deadline(core: ClientCore) -> None:
 
 
 def test_a_silent_server_is_considered_gone(core: ClientCore) -> None:
-    assert core.silent_by(2.0) == (2.0 + SILENCE_LIMIT_S, "the server sent nothing for 15 s")
+    assert core.silence_deadline(2.0) == (2.0 + SILENCE_LIMIT_S, "the server sent nothing for 15 s")
     receive(core, {"event": "alive"}, now=7.0)
-    assert core.silent_by(2.0)[0] == 7.0 + SILENCE_LIMIT_S
+    assert core.silence_deadline(2.0)[0] == 7.0 + SILENCE_LIMIT_S
 
 
 def test_an_unanswered_goal_is_lost_if_it_was_sent_and_rejected_otherwise(core: ClientCore) -> None:

@@ -134,7 +134,7 @@ class Publisher:
     def tick(self) -> None:
         """Disconnect from the server if it hangs. Call this every few seconds."""
         server = self._connection
-        if server and self._loop.time() > server.silent_by(0.0)[0]:
+        if server and self._loop.time() > server.silence_deadline(0.0)[0]:
             path = log.sanitize(server.path)
             log.write_limited("silence", f"the server at {path} does not respond; restart it if it hangs")
             server.abort()

@@ -184,10 +184,10 @@ class RobotConnection(Connection):
         """Return infinity, because followed goals are only lost when the whole connection ends."""
         return float("inf")
 
-    def silent_by(self, began: float) -> tuple[float, str]:
+    def silence_deadline(self, waiting_since: float) -> tuple[float, str]:
         """Return when a silent or absent robot counts as lost, and the error message for that."""
         if self.absent_since is None:
-            return super().silent_by(began)
+            return super().silence_deadline(waiting_since)
         return self.absent_since + ABSENCE_LIMIT_S, f"{self.absence} (for {ABSENCE_LIMIT_S:g} s)"
 
     def unsupported(self, request: Request) -> TalkError | None:

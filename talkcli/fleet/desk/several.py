@@ -390,7 +390,7 @@ class RobotRequest:
         if fail_if_late:
             now = time.monotonic()
             self.connection.expire(now)
-            silent_at, why = self.connection.silent_by(self._since)
+            silent_at, why = self.connection.silence_deadline(self._since)
             if now > silent_at:
                 self.connection.end(why)
         while self._handles and (self._handles[0].state.terminal or self._handles[0]._lose_if_disconnected()):
