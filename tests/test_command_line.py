@@ -65,7 +65,7 @@ def error_of(err: str) -> dict[str, Any]:
             "unknown option '--loud'. To speak a text that starts with '-', type: talk say -- TEXT",
         ),
         (["say", "-5"], "unknown option '-5'. To speak a text that starts with '-', type: talk say -- TEXT"),
-        (["say", "-t", "nan", "-w", "hello"], "-t / --timeout: must be a number, got 'nan'"),
+        (["say", "-t", "nan", "-w", "hello"], "-t / --timeout: must be a time such as 5s, 500ms, 2m or 1h, got 'nan'"),
         (["wait", "-t", "0"], "-t / --timeout: must be "),
         (["cancel", "--key", "k\udcff"], "--key: the byte 0xff is not valid UTF-8"),
         (["set", "--voice", "k\udcff"], "--voice: the byte 0xff is not valid UTF-8"),

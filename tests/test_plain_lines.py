@@ -39,7 +39,7 @@ SPELLINGS = {form: row for row in ROWS for part in row.flags.split("/") for form
 OPTIONS = sorted(SPELLINGS)
 VALUES = [
     *("0", "1", "7", "0.5", "1.0", "80", "451", "-3", "+5", "1_0", " 5", "1e3", ".5", "5.", "nan", "inf", "", "٣"),
-    "9" * 30,
+    *("9" * 30, "500ms", "2m", "0.5ms", "nans"),
 ]
 WORDS = [
     *(*OPTIONS, *OPTIONS, *PLAIN, *VALUES),

@@ -20,7 +20,6 @@ from talkcli.cli.command import ALL_EXIT_CODES, COMMON_OPTIONS, OUTPUT_FILE, lon
 from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import CommonOptions, note, run_command, show_error, write_error_line
 from talkcli.errors import UsageError
-from talkcli.goals.options import INTEGER, NUMBER, SECONDS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -50,6 +49,12 @@ _FOREIGN_NAMES = {
 }
 
 
+_TIME_HELP = (
+    "A TIME is a number with a unit: 500ms, 5s, 2m or 1h. Without a unit, it is in seconds, or in milliseconds for "
+    "--lead-in."
+)
+
+
 class _OptionType(click.FloatRange):
     """The click type that parses and checks the value of an option.
 
@@ -65,7 +70,7 @@ class _OptionType(click.FloatRange):
         try:
             return read_value(self._option, str(value))
         except ValueError as error:
-            if self._option.kind in (INTEGER, NUMBER, SECONDS):
+            if int in self._option.kind.types:
                 source = None  # click adds the option's name to the message
             elif ctx and ctx.get_parameter_source(self._option.name) is not ParameterSource.ENVIRONMENT:
                 source = long_flag(self._option)
@@ -75,7 +80,7 @@ class _OptionType(click.FloatRange):
 
     def _describe_range(self) -> str:
         """Return the range of valid numbers as text for click's help."""
-        return self._option.range
+        return self._option.range + self._option.unit * bool(self._option.kind.time_unit)
 
 
 def _make_click_option(option: Option, *, common: bool = False) -> click.Option:
@@ -258,6 +263,8 @@ class _CommandGroup(_HelpfulCommand, click.Group):
         """Write the list of commands and the help of the common options."""
         self.format_commands(ctx, formatter)
         self.write_options("Common options, before or after the command", self.get_params(ctx), ctx, formatter)
+        formatter.write_paragraph()
+        formatter.write_text(_TIME_HELP)
 
 
 @click.group(

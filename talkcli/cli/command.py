@@ -9,7 +9,7 @@ This module also parses option values, and texts that may contain invalid UTF-8.
 from __future__ import annotations
 
 from talkcli.frozen import TYPE_CHECKING, frozen
-from talkcli.goals.options import FLAG, ID, INTEGER, NUMBER, PATH, SECONDS, WORD, Kind, Option
+from talkcli.goals.options import FLAG, ID, PATH, SECONDS, WORD, Kind, Option
 from talkcli.paths import named_robot
 
 if TYPE_CHECKING:
@@ -27,6 +27,16 @@ if TYPE_CHECKING:
 OUTPUT_FILE = Kind("string", (str,), "must be a string")
 #: File permissions in octal.
 FILE_MODE = Kind("string", (str,), "must be a string", "MODE")
+#: How many seconds a command waits. The time may be infinite.
+TIME_LIMIT = Kind("number", (int, float), "must be a number", "TIME", time_unit="s")
+
+#: The units of time that can follow a number, in milliseconds.
+_TIME_UNITS_MS = {"ms": 1, "s": 1_000, "m": 60_000, "h": 3_600_000}
+#: Error messages for a value that is not a time, by the unit of the option.
+_NOT_A_TIME = {
+    "s": "must be a time such as 5s, 500ms, 2m or 1h",
+    "ms": "must be a time in whole milliseconds, such as 300ms or 0.3s",
+}
 
 #: Options that can't be used with several robots.
 _SINGLE_ROBOT_OPTIONS = ("lines", "ahead", "stream", "feedback", "output")
@@ -174,11 +184,10 @@ COMMON_OPTIONS = (
     ),
     option(
         "--connect-timeout",
-        NUMBER,
-        "Keep trying to reach the server for SEC seconds. With --robot, also wait until the robot is online.",
+        TIME_LIMIT,
+        "Keep trying to reach the server for TIME, such as 10s. With --robot, also wait until the robot is online.",
         limits=(0, None),
         excludes_minimum=True,
-        metavar="SEC",
     ),
     option("--insecure", FLAG, "Send the password to the broker without TLS."),
     option("--json", FLAG, "Print results and errors as JSON objects, one per line."),
@@ -198,7 +207,7 @@ def read_value(option: Option, text: str) -> Any:
     The error message says why.
     """
     kind = option.kind
-    if kind in (INTEGER, NUMBER, SECONDS):
+    if int in kind.types:
         return _parse_number(option, text)
     if kind is FILE_MODE:
         return _parse_file_mode(text)
@@ -215,19 +224,29 @@ def read_value(option: Option, text: str) -> Any:
 
 
 def _parse_number(option: Option, text: str) -> float:
-    """Parse a number for this option. Raise ValueError if it is invalid."""
-    whole = option.kind is INTEGER
+    """Parse a number or a duration for this option. Raise ValueError if it is invalid."""
+    unit, whole = option.kind.time_unit, float not in option.kind.types
+    wanted = _NOT_A_TIME.get(unit) or f"must be a {'whole ' * whole}number"
     try:
-        value = int(text) if whole else float(text)
-    except ValueError:
-        raise ValueError(f"must be a {'whole ' * whole}number, got '{text}'") from None
-    if value != value:  # NaN is the only value that differs from itself
-        raise ValueError(f"must be a number, got '{text}'")
+        if unit and text.endswith(("h", "m", "s")):
+            value = _parse_duration(text, unit)
+        else:
+            value = int(text) if whole else float(text)
+        if value != value or (whole and value != int(value)):  # NaN is the only value that differs from itself
+            raise ValueError
+    except (LookupError, OverflowError, ValueError):
+        raise ValueError(f"{wanted}, got '{text}'") from None
     if option.kind is SECONDS and value == float("inf"):
         raise ValueError("must not be infinite; 0 means no limit")
     if option.is_out_of_range(value):
-        raise ValueError(f"must be {option.range}, got {text}")
-    return value
+        raise ValueError(f"must be {option.range}{option.unit}, got {text}")
+    return int(value) if whole else value
+
+
+def _parse_duration(text: str, unit: str) -> float:
+    """Convert a duration such as 2m to this unit. Raise LookupError or ValueError if it is malformed."""
+    number = text.rstrip("hms")
+    return round(float(number) * _TIME_UNITS_MS[text[len(number) :]] / _TIME_UNITS_MS[unit], 6)
 
 
 def _parse_file_mode(text: str) -> int:

@@ -8,10 +8,21 @@ from __future__ import annotations
 
 import os
 
-from talkcli.cli.command import FILE_MODE, OUTPUT_FILE, Command, long_flag, option
+from talkcli.cli.command import FILE_MODE, OUTPUT_FILE, TIME_LIMIT, Command, long_flag, option
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals import options as goal_options
-from talkcli.goals.options import FLAG, ID, IDS, INTEGER, MAX_LOG_GOALS, MAX_TEXT_CHARS, NUMBER, TEXT, WORD, Option
+from talkcli.goals.options import (
+    FLAG,
+    ID,
+    IDS,
+    INTEGER,
+    MAX_LOG_GOALS,
+    MAX_TEXT_CHARS,
+    MILLISECONDS,
+    TEXT,
+    WORD,
+    Option,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -23,7 +34,7 @@ MAX_QUEUED_GOALS = 10_000
 
 def _timeout_option(help_text: str) -> Option:
     """Return a --timeout option with this help text."""
-    return option("-t, --timeout", NUMBER, help_text, limits=(0, None), excludes_minimum=True, metavar="SEC")
+    return option("-t, --timeout", TIME_LIMIT, help_text, limits=(0, None), excludes_minimum=True)
 
 
 def _print_unit_option(*names: str) -> Option:
@@ -38,7 +49,9 @@ def _say_options() -> Iterator[Option]:
         if each.flags:
             yield replace(each, env="", help=f"{each.help}  [env var with -o: {each.env}]") if each.env else each
         if each.name == "wait":
-            yield _timeout_option("With --wait, cancel the sentence after SEC seconds. The time in the queue counts.")
+            yield _timeout_option(
+                "With --wait, cancel the sentence after TIME, such as 20s. The time in the queue counts."
+            )
         elif each.name == "id":
             what = "Set the sender's name, which is shown in the log."
             yield Option("name", WORD, special_flags="--as", metavar="NAME", help=what, env="TALK_NAME")
@@ -127,12 +140,12 @@ _SERVE_OPTIONS = (
     ),
     option(
         "--lead-in",
-        INTEGER,
-        "Play MS milliseconds of silence if the output was idle. HDMI, USB and Bluetooth outputs then don't swallow "
-        "the first word.",
+        MILLISECONDS,
+        "Play silence, such as 300ms, if the output was idle. HDMI, USB and Bluetooth outputs then don't swallow the "
+        "first word.",
         default=0,
         limits=(0, goal_options.MAX_LEAD_IN_MS),
-        metavar="MS",
+        unit=" milliseconds",
     ),
     option("--audible", FLAG, "Abort sentences if the output is muted."),
     option(
@@ -214,9 +227,9 @@ _ROWS = (
         talk say "battery low"
         talk say --wait -- "$text" || echo "nobody heard it"
         talk say -wf "please step back"         show each word as it is heard
-        talk say --key battery --throttle 60 "battery low"
+        talk say --key battery --throttle 1m "battery low"
         fortune | talk say -
-        tail -n 0 -F log | talk say --lines --ttl 10
+        tail -n 0 -F log | talk say --lines --ttl 10s
         llm | talk say --stream --wait
         talk say -o hello.wav "hello"           needs no server
         talk say -o - "hello" | aplay
@@ -248,7 +261,7 @@ _ROWS = (
         fleet_function="several:wait",
         examples="""
         id=$(talk say "moving back"); move_back; talk wait "$id"
-        talk wait --timeout 20 12 13
+        talk wait --timeout 20s 12 13
         """,
         exit_codes={
             0: "all goals succeeded; without an ID: all goals have ended",
@@ -259,7 +272,7 @@ _ROWS = (
             "128+n": "ended by signal n; the goals continue",
         },
         options=(
-            _timeout_option("Wait for at most SEC seconds."),
+            _timeout_option("Wait for at most TIME, such as 20s."),
             option("-f, --feedback", FLAG, "Show each word as it is heard."),
         ),
         argument=_GOAL_IDS,

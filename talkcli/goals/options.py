@@ -90,6 +90,8 @@ class Kind:
     metavar: str = ""
     #: additional check of a value, which returns an error message or None
     check: Callable[[Any], str | None] | None = None
+    #: if the value is a duration, its unit: "s" or "ms". The command line also accepts other units, such as 2m.
+    time_unit: str = ""
 
 
 def is_clients_id(goal_id: str) -> bool:
@@ -150,7 +152,8 @@ INTEGER = Kind("integer", (int,), "must be an integer", "N")
 _OFFSET = Kind("integer", (int,), "must be an integer", check=_offset_error)
 NUMBER = Kind("number", (int, float), "must be a number", "X")
 #: A duration in seconds, which can't be negative.
-SECONDS = Kind("number", (int, float), "must be a number", "SEC")
+SECONDS = Kind("number", (int, float), "must be a number", "TIME", time_unit="s")
+MILLISECONDS = Kind("integer", (int,), "must be an integer", "TIME", time_unit="ms")
 DATA = Kind("object", (dict,), f"must be an object of at most {MAX_DATA_BYTES} bytes", check=_data_error)
 ID = Kind("id", (str,), "must be a string", "ID", _id_error)
 IDS = Kind("list", (list, tuple), f"must be a list of at most {MAX_IDS} ids", "[ID]...", _ids_error)
@@ -309,7 +312,7 @@ def _voice_error(value: str) -> str | None:
     return None if value else "the voice must not be empty"
 
 
-_EXPIRY_HELP = "Drop sentences that can't start within SEC seconds; 0 means no limit."
+_EXPIRY_HELP = "Drop sentences that can't start within TIME, such as 5s; 0 means no limit."
 
 #: All options of a goal, in the order of the help text and the protocol's document.
 OPTIONS = (
@@ -383,7 +386,7 @@ OPTIONS = (
         SECONDS,
         "the goal is RECALLED if it has not started after this many seconds; 0 means no limit",
         limits=(0, None),
-        help="Drop the sentence if it can't start within SEC seconds; 0 means no limit.",
+        help="Drop the sentence if it can't start within TIME, such as 5s; 0 means no limit.",
         setting=Setting(
             0,
             none_value=0,
@@ -411,7 +414,7 @@ OPTIONS = (
         "reject the goal if the same text is waiting, is being spoken, or started less than this many seconds ago. For "
         "a goal with a key, keys are compared instead of texts, and waiting goals are ignored",
         limits=(0, None),
-        help="Skip the sentence if it was spoken in the last SEC seconds. With --key, sentences with this KEY count.",
+        help="Skip the sentence if it was spoken in the last TIME. With --key, sentences with this KEY count.",
     ),
     Option(
         "id",
@@ -481,12 +484,11 @@ OPTIONS = (
     ),
     Option(
         "lead_in",
-        INTEGER,
+        MILLISECONDS,
         "milliseconds of silence before the sentence, even if another sentence has just ended; 0 means none",
         limits=(0, MAX_LEAD_IN_MS),
         unit=" milliseconds",
-        metavar="MS",
-        help="Play MS milliseconds of silence before the sentence; 0 means none. [default: the server's setting]",
+        help="Play silence before the sentence, such as 300ms; 0 means none. [default: the server's setting]",
         for_engine=True,
     ),
     Option(
@@ -516,7 +518,8 @@ OPTIONS = (
         "aborted (`text_stalled`)",
         default=STALL_S,
         limits=(MIN_STALL_S, MAX_STALL_S),
-        help="With --stream, stop if no text arrives for SEC seconds. The time starts when all of the text was spoken.",
+        unit=" seconds",
+        help="With --stream, stop if no text arrives for TIME. The time starts when all of the text was spoken.",
     ),
     Option(
         "format",

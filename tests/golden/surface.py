@@ -37,8 +37,9 @@ ERRORS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("say", (
         "", "''", "'  '", "hello", "--wait hello", "--prempt hello", "-t 5 hello", "-wt 0 hello", "-wt never hello",
         "--preempt --queue --flush hello", "--queue --flush hello", "--priority high hello", "--priority 1000001 hello",
-        "--ttl -1 hello", "--ttl nan hello", "--key '' hello", "--throttle -1 hello", "--id '' hello",
-        "--id 4k7f-12 hello", "--id 12 hello", "--id 'a b' hello", "--as '' hello", "--rate 79 hello",
+        "--ttl -1 hello", "--ttl nan hello", "--ttl 5x hello", "--lead-in 0.5ms hello",
+        "--stall 2m --stream", "--key '' hello", "--throttle -1 hello", "--id '' hello", "--id 4k7f-12 hello",
+        "--id 12 hello", "--id 'a b' hello", "--as '' hello", "--rate 79 hello",
         "--rate 451 hello", "--rate 99.5 hello", "--volume 1.1 hello", "--volume loud hello", "--pitch 101 hello",
         "--voice '' hello", "-o", "-o '' hello", "-o /nowhere/x.wav hello", "-o x.wav --key k hello", "--lines hello",
         "-- ''",

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 import talkcli
 from talkcli import Client, Goal
-from talkcli.cli.command import FILE_MODE, read_value
+from talkcli.cli.command import FILE_MODE, TIME_LIMIT, read_value
 from talkcli.cli.commands import COMMANDS
 from talkcli.engine import protocol
 from talkcli.frozen import fields, replace
@@ -330,6 +330,29 @@ def test_limits_are_the_same_on_the_wire_and_on_the_command_line() -> None:
     for option, message in zip(LIMITED, wanted, strict=True):
         with pytest.raises(ValueError, match=f"must be {message}, got 'abc'$"):
             read_value(option, "abc")
+
+
+TTL, LEAD_IN, LIMIT = ROWS["ttl"], ROWS["lead_in"], Option("x", TIME_LIMIT, limits=(0, None))
+
+
+@pytest.mark.parametrize(
+    ("option", "values", "malformed"),
+    [
+        (TTL, {"5": 5, "0.5": 0.5, "500ms": 0.5, "5s": 5, "2m": 120, "1h": 3600, "1.5h": 5400, "0s": 0}, "an inf infs"),
+        (LEAD_IN, {"300": 300, "300ms": 300, "0.3s": 300, "1.001s": 1001, "0m": 0}, "0.3 0.5ms infs 10s 1e999s"),
+        (LIMIT, {"9": 9, "inf": math.inf, "20s": 20}, "s ms 5x 5sm 5sec 1m30s nans -1s 5d"),
+        (ROWS["volume"], {}, "1s 500ms"),
+        (ROWS["rate"], {}, "100ms 200s"),
+    ],
+    ids=["seconds", "milliseconds", "limit", "number", "integer"],
+)
+def test_a_time_may_have_a_unit(option: Option, values: dict[str, float], malformed: str) -> None:
+    for text, value in values.items():
+        read = read_value(option, text)
+        assert (read, type(read)) == (value, int if option is LEAD_IN else float)
+    for text in (*malformed.split(), ""):
+        with pytest.raises(ValueError, match="must "):
+            read_value(option, text)
 
 
 def test_a_plain_command_line_is_parsed_without_compiling_options() -> None:
