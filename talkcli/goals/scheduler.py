@@ -223,9 +223,8 @@ class Scheduler:
         record = Record(f"{self.boot}-{number}", number, asked, sender, now.wall, self._may_preempt(say), expires_at)
         record.first_chars = len(say.text)
         by = canceled_by or self._early_cancels.find(say.id, now.monotonic)
-        refused = self._find_refusal(say, server_refusal, first) or (
-            None if canceled_by else self._find_repeat(say, record, now)
-        )
+        refused = self._find_refusal(say, server_refusal, first)
+        refused = refused or (None if canceled_by else self._find_repeat(say, record, now))
         expired = expires_at <= now.monotonic
         recalled = self._find_room(say)
         if recalled is None and not (by or refused or expired):
