@@ -105,7 +105,7 @@ def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, 
 def _build_command(
     command: Command, given: dict[str, Any], words: list[str], environment: Mapping[str, str]
 ) -> PlainCommand | None:
-    """Add defaults, and check the options. Return None if click has to parse the command line."""
+    """Return the checked command with its defaults, or None if click has to parse the command line."""
     common = {name: given.pop(name) for name in _COMMON_NAMES & given.keys()}
     typed = frozenset(given)
     for option in command.options:

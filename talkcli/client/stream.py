@@ -90,7 +90,7 @@ class SpeechStream:
         return self._refused or (self.goal is not None and self.goal.state.terminal)
 
     def _send(self) -> bool:
-        """Send all text that can be sent. Return whether the goal accepts more."""
+        """Send all text that can be sent, and wait for the answers. Return whether the goal accepts more."""
         connection, resends = self._connection, 0
         while not self._stopped and (request := self._text.request_to_send()):
             if isinstance(request, Say):

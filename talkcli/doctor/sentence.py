@@ -142,9 +142,9 @@ def _convert_ended_goal(goal: Goal) -> SentenceResult:
 
 
 def speak_beside_server(client: Client, options: EngineOptions, limit: float) -> SentenceResult:
-    """Speak a sentence at zero volume. The result shows whether the server spoke meanwhile.
+    """Speak a silent sentence with the doctor's own engine, beside the server. Return how it ended.
 
-    The doctor's own engine speaks the sentence.
+    The result also shows whether the server spoke at the same time.
     """
     try:
         before = client.status()
