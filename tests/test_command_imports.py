@@ -20,7 +20,7 @@ HEAVY = [
     *("pyttsx3", "espeakng_loader", "platformdirs"),
     *(
         "talkcli.goals.scheduler",
-        "talkcli.goals.history",
+        "talkcli.goals.memory",
         "talkcli.engine",
         "talkcli.server.run",
         "talkcli.server.speech",

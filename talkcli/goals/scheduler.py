@@ -20,7 +20,7 @@ from talkcli.errors import RequestRefused
 from talkcli.frozen import frozen, replace
 from talkcli.goals import options
 from talkcli.goals.goal import By, Output, Sender
-from talkcli.goals.history import EarlyCancels, History, SpeechTimes
+from talkcli.goals.memory import EarlyCancels, RecentGoals, SpeechTimes
 from talkcli.goals.queue import Queue
 from talkcli.goals.reasons import Reason, Refusal
 from talkcli.goals.record import Record
@@ -129,7 +129,7 @@ class Scheduler:
         self.max_queue = max_queue
         self.max_text = max_text
         self.pending = Queue()
-        self.history = History()
+        self.recent = RecentGoals()
         self.voices = voices or VoiceScheduler()
         #: the goal that is being spoken or stopped, or None
         self.active: Record | None = None
@@ -159,7 +159,7 @@ class Scheduler:
 
         Goals that ended long ago are forgotten.
         """
-        return self._by_id.get(goal_id) or self.history.find(goal_id)
+        return self._by_id.get(goal_id) or self.recent.find(goal_id)
 
     def has_room(self, say: Say) -> bool:
         """Return whether the queue has room for a goal, or can make room.
@@ -232,7 +232,7 @@ class Scheduler:
         if refused:
             record.reason, words = refused
             record.state, record.message, record.ended_at = State.REJECTED, f"not spoken: {words}", now.wall
-            self.history.add(record)
+            self.recent.add(record)
             return record, [StateChange(record, State.REJECTED)]
         record.id, record.more = say.id or record.id, say.more
         self._by_id[record.id] = record
@@ -841,7 +841,7 @@ class Scheduler:
     def _end(
         self, record: Record, state: State, reason: Reason | None, message: str, by: By | None, now: Now
     ) -> list[Effect]:
-        """End a goal in this state, move it to the history, and start the next one. Return the effects."""
+        """End a goal in this state, move it to the recent goals, and start the next one. Return the effects."""
         record.change_state(state)
         record.reason, record.message, record.by = reason, message, by
         record.ended_at, record.paused, record.more, record.waits = now.wall, False, False, False
@@ -849,7 +849,7 @@ class Scheduler:
         if record.begun_end and state is not State.ABORTED:
             self._speech_times.add(record)
         self._by_id.pop(record.id)
-        self.history.add(record)
+        self.recent.add(record)
         if record is not self.active:
             return [StateChange(record, state)]
         self.active = None

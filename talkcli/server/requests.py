@@ -416,7 +416,7 @@ class Requests:
 
     def _answer_overview(self, pending: PendingRequest) -> None:
         """Reply with the state of the server, and its active, pending and recent goals."""
-        recent = self._scheduler.history.latest(RECENT_GOALS, include_rejected=False)
+        recent = self._scheduler.recent.latest(RECENT_GOALS, include_rejected=False)
         active = self._scheduler.active
         now = active.snapshot().to_json() if active else None
         goals = chain(_goal_items("pending", list(self._scheduler.pending)), _goal_items("recent", recent))
@@ -435,7 +435,7 @@ class Requests:
 
     async def _log(self, pending: PendingRequest, request: Log) -> None:
         """Reply with the most recently ended goals."""
-        records = self._scheduler.history.latest(request.count, include_rejected=True)
+        records = self._scheduler.recent.latest(request.count, include_rejected=True)
         pending.answer(_goal_items("goal", records), count=len(records))
 
     async def _set(self, pending: PendingRequest, request: Set) -> None:

@@ -1,4 +1,4 @@
-"""The scheduler's results: messages, effects, times, the result of a cancel, and the history."""
+"""The scheduler's results: messages, effects, times, the result of a cancel, and the recent goals."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from math import inf
 
 import pytest
 
-from talkcli.goals import history
+from talkcli.goals import memory
 from talkcli.goals.goal import By, Output
-from talkcli.goals.history import EARLY_CANCEL_S, MAX_EARLY_CANCELS, MAX_SPEECH_TIMES
+from talkcli.goals.memory import EARLY_CANCEL_S, MAX_EARLY_CANCELS, MAX_SPEECH_TIMES
 from talkcli.goals.options import Cancel, Say
 from talkcli.goals.reasons import Reason
 from talkcli.goals.scheduler import CONFIRM_SILENCE_S, Cancellation, Now, Scheduler
@@ -282,7 +282,7 @@ def test_a_goal_stops_waiting_for_room_if_it_has_room_or_never_will() -> None:
 
 def test_stored_keys_and_texts_are_limited_and_the_oldest_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     assert MAX_SPEECH_TIMES == 20_000
-    monkeypatch.setattr(history, "MAX_SPEECH_TIMES", 6)
+    monkeypatch.setattr(memory, "MAX_SPEECH_TIMES", 6)
     robot = Robot()
     for name in ("a", "b", "c", "a", "d"):
         robot.report("completed", robot.submit(Say(f"text {name}", key=f"key {name}")).id)
@@ -295,7 +295,7 @@ def test_stored_keys_and_texts_are_limited_and_the_oldest_is_dropped(monkeypatch
 
 def test_a_thousand_early_cancels_are_stored_and_the_oldest_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (EARLY_CANCEL_S, MAX_EARLY_CANCELS) == (60, 1_000)
-    monkeypatch.setattr(history, "MAX_EARLY_CANCELS", 3)
+    monkeypatch.setattr(memory, "MAX_EARLY_CANCELS", 3)
     robot = play("cancel one two three; cancel one four; cancel 4k7f-8 9z9z-7 17 -x")
     robot.play("a id=one; b id=three; c id=four; d id=two")
     assert robot.outcome() == "d ACTIVE; a b c RECALLED canceled by door"

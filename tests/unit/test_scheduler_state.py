@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import talkcli
-from talkcli.goals.history import History
+from talkcli.goals.memory import RecentGoals
 from talkcli.goals.queue import Queue
 from talkcli.goals.record import Record
 from talkcli.goals.scheduler import Scheduler
@@ -18,10 +18,14 @@ PACKAGE = Path(talkcli.__file__).parent
 #: Attributes of the scheduler, of its records and of its other objects.
 STATE = {
     *(name for cls in (Record, NeuralVoice) for name in cls.__slots__),
-    *(name for part in (Scheduler("4k7f", max_queue=1), History(), Queue(), VoiceScheduler()) for name in vars(part)),
+    *(
+        name
+        for part in (Scheduler("4k7f", max_queue=1), RecentGoals(), Queue(), VoiceScheduler())
+        for name in vars(part)
+    ),
 }
 #: Objects of the scheduler that other packages may read, with the methods that they may call.
-READ = {"history": {"find", "latest", "log"}, "pending": {"first"}, "voices": {"failure", "to_json"}}
+READ = {"recent": {"find", "latest", "log"}, "pending": {"first"}, "voices": {"failure", "to_json"}}
 
 
 def writes(source: str) -> list[str]:
@@ -50,7 +54,7 @@ def users() -> list[Path]:
 
 def test_only_the_server_imports_the_scheduler() -> None:
     """This ensures that the test below checks all modules that could change the state."""
-    names = ("goals.scheduler", "goals.record", "goals.queue", "goals.history", "goals.voices")
+    names = ("goals.scheduler", "goals.record", "goals.queue", "goals.memory", "goals.voices")
     for path in PACKAGE.rglob("*.py"):
         if path.parent.name not in {"goals", "server"}:
             source = path.read_text("utf-8")
@@ -72,7 +76,7 @@ def test_no_module_outside_goals_writes_to_the_schedulers_state(path: Path) -> N
         "active.spoken_end += 1",
         "speech.scheduler.voices.request('piper/joe', now)",
         "self._scheduler.pending.remove(record)",
-        "scheduler.history.add(record)",
+        "scheduler.recent.add(record)",
         "setattr(record, 'state', state)",
     ],
 )

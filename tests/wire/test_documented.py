@@ -12,7 +12,7 @@ from talkcli.fleet import topics
 from talkcli.fleet.bridge import policy
 from talkcli.goals import states
 from talkcli.goals.goal import Goal
-from talkcli.goals.history import MAX_RECALLED_GOALS, MAX_REJECTED_GOALS, MAX_SPOKEN_GOALS
+from talkcli.goals.memory import MAX_RECALLED_GOALS, MAX_REJECTED_GOALS, MAX_SPOKEN_GOALS
 from talkcli.goals.options import GROWTH_FACTOR, MAX_TEXT_BYTES, MAX_TEXT_CHARS
 from talkcli.goals.states import State
 from talkcli.protocol import events

@@ -39,7 +39,7 @@ EARLY_CANCEL_S = 60.0
 MAX_EARLY_CANCELS = 1_000
 
 
-class History:
+class RecentGoals:
     """The records of recently ended goals, oldest first.
 
     The number of goals and the size of their texts are limited.
