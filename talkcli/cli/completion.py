@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 COMPLETION_TIMEOUT_S = 0.5
 #: The maximum number of ended goals to offer.
 _MAX_ENDED_GOALS = 100
-#: The maximum length of a text or a name in the help text of a value.
+#: Maximum length of a text or a name in the description of a completion.
 _HELP_TEXT_CHARS = 60
 #: The file names of the completion scripts.
 _SCRIPTS = {"bash": "talk.bash", "zsh": "_talk", "fish": "talk.fish"}
@@ -132,7 +132,7 @@ def _last_word(line: str) -> tuple[str, str]:
 
 
 def _with_flag(value: str, incomplete: str) -> str:
-    """Add the flag to a value if the user is typing --option=VALUE."""
+    """Return `--option=VALUE` if the user is typing in this form. Otherwise, return the value."""
     option, equals, _ = incomplete.partition("=")
     return f"{option}={value}" if equals and option.startswith("-") else value
 

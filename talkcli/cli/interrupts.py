@@ -101,7 +101,7 @@ class Interrupts:
         return kind is Interrupted
 
     def handle_error(self, error: Interrupted | OSError) -> None:
-        """Discard the output if its reader is gone. Raise an unexpected error again.
+        """Discard the output if its reader is gone. Re-raise unexpected errors.
 
         Interrupts, timeouts and a missing reader are expected. Record in `reader_gone` whether the reader is gone.
         """

@@ -33,7 +33,7 @@ _SENTENCE_CHECK = "sentence"
 #: time, but long enough to show whether the player works.
 SILENT_TEXT, _SILENT_RATE_WPM = "talk works well", 450
 #: Advice for each reason why a goal can end. The reasons "late" and "paused" are only used by the doctor. A test checks
-#: that no reason for aborting a goal is missing.
+#: that each reason for aborting a goal has advice.
 ADVICE: dict[str, str] = {
     Reason.NO_PLAYER: "sudo apt-get install -y alsa-utils",
     Reason.AUDIO_DEVICE: "connect the loudspeaker, close other programs that play sound, and list the cards: aplay -l",

@@ -65,7 +65,7 @@ class Queue:
         return next((each for each in self if each.say.text == text), None)
 
     def goals_up_to(self, priority: int, *, only_preempting: bool) -> list[Record]:
-        """Return the goals with this priority or a lower one, or only those that may interrupt others."""
+        """Return the goals of this or a lower priority. Optionally leave out goals that don't preempt."""
         goals = self._preempting if only_preempting else self._goals
         return list(map(_record_of, goals[bisect_left(goals, (-priority,)) :]))
 

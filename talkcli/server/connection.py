@@ -68,7 +68,7 @@ class Handler(Protocol):
         """Start handling a client's request."""
 
     def input_ended(self, connection: ClientConnection) -> None:
-        """Break off a client's incomplete texts after the end of its input."""
+        """End a client's incomplete texts at the end of its input, unless others may continue them."""
 
     def is_waiting(self, connection: ClientConnection) -> bool:
         """Return whether a client is still waiting for a reply or an event."""
@@ -169,7 +169,7 @@ class PendingRequest:
             self.move_to(self._steps.send(in_time))
 
     def _leave(self) -> bool:
-        """Remove the request from its waiting list. Return False if it isn't in one."""
+        """Remove the request from its waiting list. Return whether it was waiting."""
         if self.waiting_list is None:
             return False
         del self.waiting_list[self]

@@ -89,7 +89,7 @@ class Requests:
         self.input_ended(connection)
 
     def input_ended(self, connection: ClientConnection) -> None:
-        """Break off a client's incomplete texts after the end of its input."""
+        """End a client's incomplete texts at the end of its input, unless others may continue them."""
         for record in [record for record, producer in self._producers.items() if producer is connection]:
             del self._producers[record]
             self._speech.apply(self._scheduler.producer_left(record, self._speech.advance_time()))

@@ -398,7 +398,7 @@ class Speech:
         self.apply(effects)
 
     def _handle_ready(self, ready: protocol.Ready, now: Now) -> None:
-        """Record that an engine is ready, and start the next goal. The first one sets the default voice."""
+        """Record that an engine is ready, and start the next goal. The first engine sets the voice."""
         if self.ready is None and ready.voice is not None:
             self.apply(self.scheduler.change_settings({"voice": ready.voice}, now))
         if self.ready is None or self.ready != replace(ready, player=self.ready.player):

@@ -177,5 +177,5 @@ def test_words_in_skipped_silence_start_with_the_sound() -> None:
     clock = WordClock()
     for position in (0.0, 0.2):
         clock.add(TimedWord(0, 1, position))
-    clock.skip_until(0.1)
+    clock.delay_words_until(0.1)
     assert [word.position for word in clock.pop_all()] == [0.1, 0.2]

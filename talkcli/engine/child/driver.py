@@ -276,7 +276,7 @@ class Driver:
         self._playback: Playback | None = None
 
     def iterate(self) -> Iterator[None]:
-        """Speak each text that was passed to `say`. Yield while there is none."""
+        """Speak the texts that were passed to `say`. Yield whenever all of them are spoken."""
         while True:
             if self._text is None:
                 self._proxy.setBusy(False)  # pyttsx3 sends no text while the driver is busy
@@ -327,7 +327,7 @@ class Driver:
             self._sound = replace(self._sound, **{name: kind(value)})
 
     def _speak(self, text: str) -> None:
-        """Speak a text. Notify pyttsx3, and store the results in the runner."""
+        """Speak a text. Notify pyttsx3, and store the duration and the gaps in the runner."""
         runner = self._runner
         self._proxy.notify("started-utterance")
         self._playback = playback = Playback(runner, self._notify_word)

@@ -574,7 +574,7 @@ class Playback:
         self._start_known = True
         if not all_zeros and self._players.takes_time and not self._players.handovers.goal_was_waiting:
             self._skipped = self._begin = self._sent = zeros
-            self._clock.skip_until(self._seconds(zeros))
+            self._clock.delay_words_until(self._seconds(zeros))
             self._clock.reset(self._seconds(zeros))
         return True
 

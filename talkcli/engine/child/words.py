@@ -109,8 +109,8 @@ class WordClock:
         """Add a word. Words must be added in the order of their positions."""
         self._waiting.append(word)
 
-    def skip_until(self, position: float) -> None:
-        """Move all earlier words to this position."""
+    def delay_words_until(self, position: float) -> None:
+        """Let no word begin before this position in the audio."""
         self._waiting = deque(replace(each, position=max(position, each.position)) for each in self._waiting)
 
     def reset(self, position: float) -> None:

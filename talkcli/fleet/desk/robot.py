@@ -173,7 +173,7 @@ class RobotConnection(Connection):
     def answer_deadline(self, exchange: Exchange) -> float:
         """Return the time limit for the next line of an answer, or for an absent robot's return."""
         if not isinstance(exchange, RobotExchange):
-            return float("inf")  # This is a lookup, which is repeated after each absence.
+            return float("inf")  # This exchange looks up a goal. After each absence, a new one is sent.
         if self.absent_since is None:
             by = super().answer_deadline(exchange)
         else:

@@ -141,7 +141,7 @@ def _format_row(cells: dict[str, Cell], widths: dict[str, int], screen: Screen) 
 
 
 class FleetTranscript:
-    """Formats events of robots as lines.
+    """A transcript of what the robots say and do, in lines of text.
 
     Each line begins with the time and the robot's name.
     """
@@ -181,7 +181,7 @@ class FleetTranscript:
         return self._transcripts[name].lines(event, screen, now)
 
     def change_lines(self, before: Presence | None, robot: Presence, screen: Screen, now: float) -> list[str]:
-        """Format a change of a robot or its server as a line. Forget the robot's goals.
+        """Describe in a line how a robot or its server has changed. Forget the robot's goals.
 
         Args:
             before: the presence before the change, or None if the robot was unknown.

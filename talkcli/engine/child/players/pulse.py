@@ -192,7 +192,7 @@ class PulsePlayer(Player):
         self._error = self._error or CannotSpeak(Reason.AUDIO_LOST, "the stream was ended")
 
     def gone(self) -> bool:
-        """Return whether the connection to the server is closed."""
+        """Return whether `kill` has closed the connection to the sound server."""
         return self._loop.freed
 
     @property
