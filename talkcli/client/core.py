@@ -748,7 +748,7 @@ class ClientCore:
             self._lose_goals()
         waiting, self._unsent = self._unsent, deque()
         for goal_id in self.listeners.growing:
-            self._begin(Exchange(Append(goal_id)), now)  # otherwise, the text would break off
+            self._queue_exchange(Exchange(Append(goal_id)), now)  # otherwise, the text would break off
         for goal_id, feedback in self.listeners.goals.items():
             self._follow_again(goal_id, feedback=feedback, now=now)
         if self.listeners.watches:
@@ -779,7 +779,7 @@ class ClientCore:
             if self.absent_since is None:  # after another break, the next connection follows the goal
                 self.listeners.lose(goal_id, f"{error.message}; the sentence may have been spoken")
 
-        self._begin(Exchange(Wait((goal_id,), feedback), on_reply, on_failure), now)
+        self._queue_exchange(Exchange(Wait((goal_id,), feedback), on_reply, on_failure), now)
 
     def _watch_again(self, now: float) -> None:
         """Queue a request to watch all goals again after reconnecting."""
@@ -791,9 +791,9 @@ class ClientCore:
             if self.absent_since is None:
                 self.listeners.end_watches(error.message, include_reconnecting=True)
 
-        self._begin(Exchange(Watch(), on_reply, on_failure), now)
+        self._queue_exchange(Exchange(Watch(), on_reply, on_failure), now)
 
-    def _begin(self, exchange: Exchange, now: float) -> None:
+    def _queue_exchange(self, exchange: Exchange, now: float) -> None:
         """Register an exchange, and queue its request to be sent."""
         self.register(exchange, now)
         self.queue(self.line(exchange), exchange)

@@ -73,7 +73,7 @@ def boottime() -> float:
 
 
 class Link:
-    """A connection to the broker.
+    """A single connection to the MQTT broker, which is never reconnected.
 
     Any thread may use it. Callbacks run in the thread that calls `read`.
     """
@@ -218,7 +218,7 @@ class Link:
                 self._paho.loop_write()
 
     def tick(self) -> None:
-        """Send keepalive messages, and check that the broker answers them.
+        """Send a keepalive message if one is due, and check that the broker still answers.
 
         Call this every `TICK_EVERY_S` seconds.
         """
@@ -264,9 +264,9 @@ class Link:
                 self.write()
 
     def close(self) -> None:
-        """Close the connection.
+        """Close the connection. If any message is unacknowledged, unsent data is discarded.
 
-        If any message is unacknowledged, unsent data is discarded, and no DISCONNECT packet is sent.
+        In that case, no DISCONNECT packet is sent.
         """
         with self._lock:
             logged_in = self._answer is not None and not self._answer.is_failure
@@ -336,7 +336,7 @@ class Link:
         self._deliver(Message(message.topic, bytes(message.payload), message.retain, *properties))
 
     def _on_publish(self, _client: paho.Client, _data: object, mid: int, code: ReasonCode, _: object) -> None:
-        """Call a message's `on_acknowledged` function with the broker's reason code."""
+        """Forget an acknowledged message, and pass the broker's reason code to `on_acknowledged`."""
         size, on_acknowledged = self._unacknowledged.pop(mid, (0, None))
         self.outstanding_bytes -= size
         if on_acknowledged:

@@ -77,7 +77,7 @@ class Presence:
 
 
 def bridge_rank(presence: Presence | None) -> tuple[float, str] | None:
-    """Return a bridge's rank. If several bridges use one robot name, the lowest rank keeps it.
+    """Return a bridge's rank. Of several bridges with one name, the one with the lowest rank stays.
 
     The other bridges exit. Return None if the bridge is offline.
     """
@@ -211,7 +211,7 @@ def homeassistant_device(name: str, allow: Collection[str], version: str) -> Mes
 
 
 def _command(robot: str, topic_level: str, platform: str, label: str | None, *, allowed: bool) -> JsonObject:
-    """Return a Home Assistant component that sends a request.
+    """Return a Home Assistant component that sends a request to the robot.
 
     If the request isn't allowed, the component is empty.
     """

@@ -73,7 +73,7 @@ def homeassistant_device(name: str) -> str:
 
 
 def parse_request_topic(topic: str) -> tuple[str, str] | None:
-    """Return the kind of request and the user name in a topic. For other topics, return None.
+    """Return the kind of request and the user name in a request topic, or None for other topics.
 
     Returns:
         REQUEST, PLAIN_SAY or PLAIN_CANCEL, and the client's user name. The broker's access rules verify the name.
@@ -87,7 +87,7 @@ def parse_request_topic(topic: str) -> tuple[str, str] | None:
 
 
 def checked_reply_topic(response_topic: str, user: str, robot_name: str) -> str | None:
-    """Return the topic for a robot's reply. Return None if the client may not use it.
+    """Return the topic for a robot's reply, or None if the user may not choose `response_topic`.
 
     This prevents users from making a robot publish to other users or to another robot's topic.
     """

@@ -81,7 +81,7 @@ class RecentGoals:
 
 
 class SpeechTimes:
-    """Remembers when each key and each text was last spoken."""
+    """The start times of the last goals that were spoken, by key and by text."""
 
     def __init__(self) -> None:
         #: start time and id of the last goal for each key and each hash of a text
@@ -97,7 +97,7 @@ class SpeechTimes:
                 _set_newest(self._starts, each, (record.began_at, record.id), MAX_SPEECH_TIMES)
 
     def last_goal_id(self, since: float, key: str | None, text: str) -> str | None:
-        """Return the id of the last goal after `since` with this key, or with this text if key is None.
+        """Return the id of the last goal started after `since` with this key (or text, if key is None).
 
         Return None if no such goal has started. Times are monotonic.
         """

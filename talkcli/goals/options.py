@@ -79,7 +79,7 @@ def is_neural(voice: str) -> bool:
 
 @frozen
 class Kind:
-    """A type of values that an option can have, such as numbers of seconds."""
+    """The type of an option's values, such as a duration in seconds."""
 
     #: name of the type in the protocol's document
     name: str
@@ -667,10 +667,10 @@ class Cancel:
         return self.ids is None and not self.current and self.before is None and self.key is None
 
     def select_waiting(self, goals: Sequence[Say]) -> list[int]:
-        """Return the indexes of the waiting goals that the request cancels.
+        """Return the indexes of the goals to cancel among those that wait for room in the queue.
 
-        These goals wait for room in the queue. They have an id only if their sender chose one, so `before` selects them
-        only if it names such an id.
+        Such a goal has an id only if its sender chose one. Therefore, `before` must name an id of this kind to select
+        any.
         """
         ids = set(self.ids or ())
         last = max((index for index, say in enumerate(goals) if say.id == self.before is not None), default=-1)
@@ -682,7 +682,7 @@ class Cancel:
 
 
 def require_fields(data_class: type, options: Iterable[str]) -> None:
-    """Raise TypeError if a class has no field for an option.
+    """Raise TypeError if a class lacks a field for one of these options.
 
     Called when a module is imported.
     """
@@ -699,7 +699,7 @@ DEFAULTS = Set(**{each.name: each.setting.initial for each in SETTINGS if each.s
 
 
 def bad_option(request: Say | Set) -> str | None:
-    """Return an error message if a request contains a value that is not allowed."""
+    """Return an error message if a request has a value or combination that is not allowed."""
     if isinstance(request, Say) and request.flush and request.preempt is False:
         return "flush can't be combined with preempt false, because it always interrupts"
     if isinstance(request, Say) and request.more and request.throttle is not None and request.key is None:
@@ -712,11 +712,14 @@ def bad_option(request: Say | Set) -> str | None:
 
 
 def bad_text(text: str, max_chars: int | None = MAX_TEXT_CHARS) -> Refusal | None:
-    """Return a reason and a message if a text obviously can't be spoken. Otherwise, return None.
+    """Return a reason and a message if a text is too long, malformed or without visible characters.
 
     Args:
         text: the text.
         max_chars: the maximum length, or None for no limit.
+
+    Returns:
+        None if the text seems to be speakable.
     """
     from talkcli.goals.reasons import Reason
 
@@ -769,19 +772,16 @@ def engine_options(say: Say, settings: Set) -> dict[str, Any]:
     for name in ENGINE_OPTIONS:
         own = getattr(say, name)
         found[name] = getattr(settings, name, None) if own is None else own
-    return _replace_none_values(found)
+    return _replace_placeholders(found)
 
 
 def shown_settings(settings: Set) -> JsonObject:
-    """Return the settings as shown to users.
-
-    None stands for the default voice or no time limit.
-    """
-    return _replace_none_values(fields(settings))
+    """Return the settings as a JSON object, with None for the default voice or no time limit."""
+    return _replace_placeholders(fields(settings))
 
 
-def _replace_none_values(values: dict[str, Any]) -> dict[str, Any]:
-    """Return a copy of settings. Placeholders for no value, such as a `ttl` of 0, become None."""
+def _replace_placeholders(values: dict[str, Any]) -> dict[str, Any]:
+    """Return a copy of settings, with None for each placeholder, such as a `ttl` of 0."""
     return {name: None if value == _NONE_VALUES.get(name) else value for name, value in values.items()}
 
 

@@ -70,14 +70,14 @@ class Queue:
         return list(map(_record_of, goals[bisect_left(goals, (-priority,)) :]))
 
     def displaceable_goal(self) -> Record | None:
-        """Return the newest goal of the lowest priority, if any.
+        """Return the goal to drop first from a full queue: the newest one of the lowest priority.
 
-        It is removed first if the queue is full.
+        Return None if the queue is empty.
         """
         return self._displaceable[-1][2] if self._displaceable else None
 
     def add(self, record: Record, replaced: Record | None = None) -> None:
-        """Add a goal to the queue. If it replaces a goal, it takes that goal's place.
+        """Add a goal to the queue, at the place of the already removed goal `replaced`, if any.
 
         Otherwise, its place is behind the other goals of its priority, or in front of them if the goal preempts.
 

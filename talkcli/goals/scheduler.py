@@ -41,7 +41,7 @@ CONFIRM_SILENCE_S = 1.9
 
 @frozen
 class Now:
-    """The current time on two clocks, in seconds.
+    """The current time in seconds, on the monotonic clock and on the wall clock.
 
     The monotonic clock must keep running while the machine is suspended, so that goals can expire during that time.
     """
@@ -90,7 +90,7 @@ Effect = StateChange | EngineOrder | VoiceLoadOrder | VoiceDropOrder | VoiceWarn
 
 @dataclass(slots=True)
 class Cancellation:
-    """The goals that a cancel affects, and the effects to carry out."""
+    """The goals that a cancel found, the ids it didn't find, and the effects to carry out."""
 
     #: pending goals that this cancel has recalled
     recalled: list[Record] = field(default_factory=list)
@@ -416,7 +416,7 @@ class Scheduler:
         return self._start_next(now)
 
     def fail_next(self, message: str, now: Now) -> list[Effect]:
-        """Fail the next goal, unless an engine is available. Return the effects.
+        """End the next goal as ABORTED, unless an engine is available. Return the effects.
 
         Called after a long wait for an engine.
         """
@@ -571,11 +571,11 @@ class Scheduler:
 
         Return inf if there is no time limit.
         """
-        deadlines = (self._active_deadline(), self.pending.next_expiry(), self._next_deadline())
+        deadlines = (self._active_deadline(), self.pending.next_expiry(), self._next_attempt_time())
         return min(*deadlines, *self._orphans.values())
 
     def tick(self, now: Now) -> list[Effect]:
-        """Handle all time limits that have been reached. Return the effects.
+        """End goals that are out of time, and start the next goal if possible. Return the effects.
 
         Expired goals are recalled. If the active goal was stopped and did not become silent in time, it is aborted. The
         next goal starts if it no longer has to wait for its voice.
@@ -641,7 +641,7 @@ class Scheduler:
         return options.bad_text(say.text, limit) or server_refusal
 
     def _find_repeat(self, say: Say, record: Record, now: Now) -> Refusal | None:
-        """Return a refusal if a goal repeats another too soon, and store that goal's id in `record.by`."""
+        """Return a refusal if a goal repeats another too soon. Store the other goal's id in `record.by`."""
         if say.throttle is None:
             return None
         active = self.active
@@ -765,7 +765,7 @@ class Scheduler:
             return goal.stalls_at
         return inf if self.has_engine or goal.begun_end else goal.expires_at
 
-    def _next_deadline(self) -> float:
+    def _next_attempt_time(self) -> float:
         """Return the monotonic time of the next attempt to start a goal."""
         record = None if self.active or self.paused or not self.has_engine else self.pending.first()
         if record is None:
@@ -773,7 +773,7 @@ class Scheduler:
         return 0.0 if record.next_since == inf else self._start_time(record)
 
     def _start_time(self, record: Record) -> float:
-        """Return the monotonic time at which a goal stops waiting for its voice."""
+        """Return the earliest monotonic time at which a goal may start instead of waiting for its voice."""
         return self.voices.start_time(record, self.settings.voice) if self._loads_voices else 0.0
 
     def _start_next(self, now: Now) -> list[Effect]:
@@ -787,7 +787,7 @@ class Scheduler:
         return [*effects, EngineOrder(record, Order.START)] if record else effects
 
     def _activate_next(self, now: Now) -> tuple[Record | None, list[Effect]]:
-        """Make the next goal ACTIVE if possible. Return it and the effects.
+        """Make the next goal ACTIVE if possible. Return this goal, if any, and the effects.
 
         Return None instead of a goal if no goal can start. The effects don't contain the order to speak the goal.
         """

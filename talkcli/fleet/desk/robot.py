@@ -143,7 +143,7 @@ class RobotConnection(Connection):
         self.register(exchange, self._published_at)
 
     def cancel_after_absence(self, goal_id: str, *, also_now: bool) -> None:
-        """Cancel a goal after each absence of the robot, and also now if `also_now` is true."""
+        """Cancel a goal whenever the robot comes back, and also now if `also_now` is true."""
         with self.changed:
             self._canceled.add(goal_id)
             if also_now:
@@ -171,7 +171,7 @@ class RobotConnection(Connection):
         return True
 
     def answer_deadline(self, exchange: Exchange) -> float:
-        """Return the time limit for the next line of an answer, or for an absent robot's return."""
+        """Return the time at which an exchange fails if its robot stays silent or absent."""
         if not isinstance(exchange, RobotExchange):
             return float("inf")  # This exchange looks up a goal. After each absence, a new one is sent.
         if self.absent_since is None:
@@ -199,7 +199,7 @@ class RobotConnection(Connection):
         return ProtocolMismatch(f"{self.robot}: {error.message}") if error else None
 
     def refusal(self, reply: JsonObject, items: list[JsonObject]) -> TalkError:
-        """Return the error for a refused request. Each error of the bridge has its own class."""
+        """Return the error for a refused request. The bridge's own errors have more specific classes."""
         error = super().refusal(reply, items)
         kinds = {"not_allowed": AccessDenied, "no_server": NoServer, "stale": ServerUnavailable, "lost": Lost}
         kind = kinds.get(error.code)
@@ -362,9 +362,9 @@ class RobotConnection(Connection):
                 self.fail(exchange, Lost(words))
 
         exchange.heard_at = now
-        self._begin(Exchange(Wait((str(request.id),), request.feedback), on_reply, on_failure), now)
+        self._queue_exchange(Exchange(Wait((str(request.id),), request.feedback), on_reply, on_failure), now)
 
-    def _begin(self, exchange: Exchange, now: float) -> None:
+    def _queue_exchange(self, exchange: Exchange, now: float) -> None:
         """Queue a lookup of one or all goals, and send it now unless too many are unanswered."""
         self._lookups.append(exchange)
         self._send_lookups(now)

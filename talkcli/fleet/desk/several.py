@@ -206,7 +206,7 @@ class FleetRequest:
             robot.connection.cancel_after_absence(goal_id, also_now=not is_sent)
 
     def close(self) -> None:
-        """Close the connection to the broker. This doesn't cancel the request."""
+        """Send all queued messages, and close the connection. This doesn't cancel the request."""
         began, self._began, self._closed = self._began, False, True
         if began:
             self._desk.flush(_FLUSH_LIMIT_S)
@@ -230,7 +230,7 @@ class FleetRequest:
                 self._on_presence(robot, robot.presence)
 
     def _on_refused(self, error: TalkError) -> None:
-        """Store the error if a message to the group was rejected. `results` raises this error."""
+        """Store the error for a rejected message to the group. `results` raises this error."""
         self._refused = error
 
     def _check_for_late_robots(self) -> None:
@@ -239,7 +239,7 @@ class FleetRequest:
             if not self._desk.poll(0.0, self._interrupt):
                 break
         for name in list(self._unfinished):
-            self._update(name, fail_if_late=True)
+            self._record_ended_goals(name, fail_if_late=True)
 
     def _no_robot_error(self) -> TalkError:
         """Return the error to raise if no robot matches the selection."""
@@ -259,7 +259,7 @@ class FleetRequest:
         link.subscribe(topics.robot(topics.ANY, topics.PRESENCE), retained=True)
 
     def on_disconnected(self, why: str) -> None:
-        """Treat all robots as absent until they are back. Don't accept new robots."""
+        """Treat all robots as absent until they are back, and ignore new robots from now on."""
         # Ignore robots that appear after this, because the broker may be back too late.
         self._complete = self._complete or self._began
         for each in self._robots.values():
@@ -282,7 +282,7 @@ class FleetRequest:
                 self._on_presence(robot, presence)
 
     def _on_presence(self, robot: RobotRequest, presence: Presence) -> None:
-        """Process a robot's presence. If the robot is new, add it to the request.
+        """Include a robot in the request. If it is already included, record its ended goals.
 
         Send the request if possible. After all retained messages have arrived, new robots are ignored, because they
         came online too late. Until then, every member of a group is expected to answer. Some members may have come
@@ -291,7 +291,7 @@ class FleetRequest:
         """
         name = presence.name
         if name in self._included:
-            self._update(name)
+            self._record_ended_goals(name)
             return
         if self._complete:
             return
@@ -317,7 +317,7 @@ class FleetRequest:
             if self._canceled_id is not None:
                 robot.connection.cancel_after_absence(self._canceled_id, also_now=True)
         robot.connection.on_message(message)
-        self._update(name)
+        self._record_ended_goals(name)
 
     def _get_robot(self, name: str) -> RobotRequest:
         """Return the RobotRequest for a robot. Create it if necessary."""
@@ -329,17 +329,17 @@ class FleetRequest:
         return self._robots[name]
 
     def _include(self, name: str) -> None:
-        """Add a robot to the receivers of the request."""
+        """Count a robot as selected, and expect outcomes from it."""
         self._included.add(name)
         self._unfinished.add(name)
 
-    def _update(self, name: str, *, fail_if_late: bool = False) -> None:
-        """Record the new outcomes of a robot, unless it is already finished."""
+    def _record_ended_goals(self, name: str, *, fail_if_late: bool = False) -> None:
+        """Record the outcomes of an unfinished robot's goals that have just ended."""
         if name in self._unfinished:
-            self._robots[name].update(fail_if_late=fail_if_late)
+            self._robots[name].record_ended_goals(fail_if_late=fail_if_late)
 
     def _record(self, *outcomes: Outcome) -> None:
-        """Store outcomes for `results`. A robot is finished after its last outcome."""
+        """Store outcomes for `results` to yield. A robot is finished after its last outcome."""
         self._outcomes += outcomes
         self._unfinished -= {each.robot for each in outcomes if each.last}
 
@@ -360,7 +360,7 @@ class RobotRequest:
         self._since = time.monotonic()
 
     def send(self) -> None:
-        """Send the request to this robot. Record a failure if the robot is absent."""
+        """Send the request to this robot, or record a failure if it can't be sent."""
         try:
             self.connection.check_online()
             self.connection.begin(self._request, self._on_reply, self._on_failure)
@@ -380,7 +380,7 @@ class RobotRequest:
         self.connection.expect_reply(exchange)
         self.was_asked = True
 
-    def update(self, *, fail_if_late: bool) -> None:
+    def record_ended_goals(self, *, fail_if_late: bool) -> None:
         """Keep the bridge's session alive, and record the outcomes of goals that have just ended.
 
         Args:
@@ -401,7 +401,7 @@ class RobotRequest:
             self._record(Outcome(self._name, handle.state.name, code, handle.goal, last=not self._handles))
 
     def _on_reply(self, reply: JsonObject, items: list[JsonObject]) -> None:
-        """Process the robot's reply. Wait for its goals, or record the outcomes if it has no goals."""
+        """Follow the goals that the request waits for. If there are none, record the reply's outcomes."""
         request = self._request
         found: list[Goal] = []
         if isinstance(request, Say):
@@ -417,7 +417,7 @@ class RobotRequest:
             self._record(*reply_outcomes(self._name, request, reply, items))
 
     def _on_failure(self, error: TalkError) -> None:
-        """Record that the request failed. First record the goals that it cancelled."""
+        """Record a failed request. First, record the goals that it cancelled anyway."""
         try:
             items = error.items if isinstance(error, UnknownGoal) else []
             self._record(*cancel_outcomes(self._name, items, last=False))

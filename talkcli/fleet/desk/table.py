@@ -34,7 +34,7 @@ _EMPTY_CELL: Cell = ("-", None)
 
 
 def format_robots(robots: Sequence[RobotInfo], screen: Screen, now: float) -> list[str]:
-    """Format a table of robots. The first line is the heading.
+    """Format a table of robots as lines. The first line is the heading.
 
     If a terminal is too narrow, the texts of sentences are shortened, and then columns are omitted.
 
@@ -158,7 +158,7 @@ class FleetTranscript:
         self._boots: dict[str, str] = {}
 
     def begin(self, robots: Sequence[Presence], broker: str, screen: Screen, now: float) -> list[str]:
-        """Return the heading with the number of robots. Prepare the column of names."""
+        """Fit the name column to all robots, and return a heading with their number."""
         for each in robots:
             self._columns.pad_robot(each.name, screen)  # All names must be known first, so that all lines are aligned.
             self._boots[each.name] = _boot_id(each)
@@ -170,7 +170,7 @@ class FleetTranscript:
         return [cut(f"{clock_time(now)}{COLUMN_GAP}{', '.join(parts)}; {printable(broker)}", screen.columns_left(0))]
 
     def lines(self, name: str, event: Event, screen: Screen, now: float) -> list[str]:
-        """Format an event of a robot as lines.
+        """Format a robot's event as lines.
 
         The arguments are those of `Transcript.lines`.
         """

@@ -38,7 +38,7 @@ _LIMIT_CHECK_INTERVAL_S = 0.5
 
 @frozen
 class FleetSnapshot:
-    """The state of all robots when the watch starts. They are sorted by name."""
+    """The watched robots and their states at the start of the watch, sorted by name."""
 
     robots: tuple[RobotInfo, ...]
 
@@ -99,7 +99,7 @@ FleetEvent = FleetSnapshot | RobotChanged | RobotEvent | EventsMissed | BrokerAw
 def read_robots(
     broker: Broker, timeout: float, name: str | None = None, *, with_status: bool = True
 ) -> list[RobotInfo]:
-    """Read the robots of a fleet from the broker, sorted by name.
+    """Read the presence and status of a fleet's robots from the broker, sorted by name.
 
     This includes robots that are offline.
 
@@ -125,7 +125,7 @@ def read_robots(
 
 
 class _RetainedReader:
-    """Subscribes to some topics, and collects all messages."""
+    """Subscribes to some topics on each new connection, and collects all their messages."""
 
     def __init__(self, wanted: list[str]) -> None:
         self._wanted = wanted
@@ -144,7 +144,7 @@ class _RetainedReader:
 
 
 def _read_states(messages: list[Message]) -> list[RobotInfo]:
-    """Read the state of each robot from these messages, sorted by name.
+    """Read each robot's presence and status from these messages, sorted by name.
 
     Omit robots without a presence.
     """
@@ -253,7 +253,7 @@ class FleetWatch:
     # -- time limits
 
     def _check_time_limits(self, now: float) -> None:
-        """Report robots that haven't come back in time. Raise Lost if the broker hasn't."""
+        """Report robots that haven't come back in time. Raise Lost if the broker is still away."""
         if self._away_since is not None and now - self._away_since >= ABSENCE_LIMIT_S:
             raise Lost(f"the broker at {self._broker.url} was unreachable for {ABSENCE_LIMIT_S:g} s: {self._away_why}")
         for name in [name for name, until in self._missing.items() if now >= until]:
