@@ -86,7 +86,7 @@ class EngineOptions:
 
 @frozen
 class EngineReport:
-    """What an engine process reported when it started."""
+    """What an engine process reported when it started, or why it could not start."""
 
     #: the engine's first message, or None if the engine did not start
     ready: protocol.Ready | None = None
@@ -99,7 +99,7 @@ class EngineReport:
 
 @frozen
 class VoiceTrial:
-    """The result of trying a neural voice."""
+    """The loading time, speed and memory use of a neural voice, or its fault."""
 
     #: loading time in seconds, or None if the voice was not loaded
     load_s: float | None = None
@@ -136,7 +136,7 @@ def start_engine(options: EngineOptions, limit: float = math.inf, wav_fd: int | 
 
 
 def probe_engine(options: EngineOptions) -> EngineReport:
-    """Start an engine process to test whether it works, and end it. Return its report."""
+    """Start an engine process and end it. Return what it reported, or why it could not start."""
     ready = None
     try:
         with start_engine(options) as engine:
@@ -165,7 +165,7 @@ def judge_python() -> Finding:
 
 
 def judge_engine(pyttsx3_version: str | None, report: EngineReport, *, server_engine: str | None) -> list[Finding]:
-    """Check pyttsx3, libespeak-ng and the voices. Return the findings.
+    """Return the findings about pyttsx3, libespeak-ng and the voices, based on an engine's report.
 
     Args:
         pyttsx3_version: version of pyttsx3, or None if it is not installed.
@@ -195,7 +195,7 @@ def judge_engine(pyttsx3_version: str | None, report: EngineReport, *, server_en
 
 
 def _judge_library(library_version: str | None, voices: tuple[str, ...] | None) -> list[Finding]:
-    """Check libespeak-ng and the engine's voices. Return the findings."""
+    """Return the findings about libespeak-ng's version and the number of voices."""
     found = [] if library_version is None else [ok("libespeak-ng", f"{library_version}, with its data")]
     if voices is None:
         return [*found, warning("voices", "the engine did not list its voices in time", "run talk doctor again")]
@@ -208,7 +208,7 @@ def _judge_library(library_version: str | None, voices: tuple[str, ...] | None) 
 def check_neural(
     used_voice: str | None, options: EngineOptions, limit: float, server_voices: dict[str, Any] | None
 ) -> Iterator[Finding]:
-    """Check neural voices: the packages, the files and the voice in use. Yield the findings.
+    """Check the packages and files of neural voices, and try the voice in use. Yield the findings.
 
     Args:
         used_voice: the voice in use, as the user wrote it, or None if no neural voice is in use.
@@ -229,7 +229,7 @@ def check_neural(
 
 
 def _check_voice_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
-    """Check the files of all installed neural voices. Yield a finding."""
+    """Check the files of all installed neural voices. Yield one finding if there are any voices."""
     valid, invalid = [], []
     for name, path in models.find_models(env).items():
         try:
@@ -249,7 +249,7 @@ def _check_voice_files(env: Mapping[str, str] | None) -> Iterator[Finding]:
 
 
 def _find_package_fault(env: Mapping[str, str]) -> tuple[str, str] | None:
-    """Find a package for neural voices that can't be imported. Return the fault and the advice, if any."""
+    """Try to import the packages for neural voices. Return a fault with advice, or None."""
     missing = models.missing_package()
     if missing is not None:
         return _split_advice(missing)
@@ -280,7 +280,7 @@ def _split_advice(message: str) -> tuple[str, str]:
 
 
 def _try_voice(voice: str, options: EngineOptions, limit: float) -> VoiceTrial:
-    """Load a voice, and measure how fast it synthesizes speech. Return the result.
+    """Load a voice, and measure how fast it synthesizes speech. Return the figures or the fault.
 
     Nothing is played.
     """
@@ -302,7 +302,7 @@ def _try_voice(voice: str, options: EngineOptions, limit: float) -> VoiceTrial:
 
 
 def _speak(engine: PrivateEngine, voice: str, text: str) -> tuple[protocol.Ended, float | None]:
-    """Speak a text. Return its `Ended` event and the time taken to load the voice.
+    """Speak a text to its end. Return the `Ended` event and the seconds taken to load the voice.
 
     The time is None if the voice was already loaded.
     """
@@ -324,7 +324,7 @@ def _memory_of(pid: int) -> int | None:
 
 
 def judge_server_voices(voices: dict[str, Any]) -> list[Finding]:
-    """Check the state of the server's neural voices. Return the findings.
+    """Check whether the server can speak with its neural voices. Return the findings.
 
     `voices` is the server's description of its neural voices.
     """

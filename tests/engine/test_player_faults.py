@@ -264,7 +264,7 @@ def _status(child: PlayerProcess, seconds: float = 10.0) -> int:
     end = time.monotonic() + seconds
     while (status := child.poll()) is None:
         assert time.monotonic() < end, "the child has not ended"
-        child.await_end(0.1)
+        child.await_exit(0.1)
     child.release()
     return status
 

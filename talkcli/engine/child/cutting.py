@@ -94,7 +94,7 @@ _REST = {
 
 
 class GrowingText:
-    """A text that grows while it is spoken.
+    """A text that grows while it is spoken part by part.
 
     It keeps track of how much of the text was passed to the synthesizer.
     """
@@ -116,7 +116,7 @@ class GrowingText:
         return self.ended and not self.text[self._position :].strip()
 
     def append(self, text: str, now: float) -> None:
-        """Add text at the end."""
+        """Add text at the end, and record the time of the change."""
         if text:
             self.text += text
             self._changed_at = now
@@ -132,7 +132,7 @@ class GrowingText:
         self.text, self._position, self.ended = self.text[: self._position], position, True
 
     def take_next_part(self, now: float, buffered_s: float) -> tuple[int, int] | None:
-        """Take the next part of the text. Return its offsets, or None if it can't be spoken yet.
+        """Take the next part that can be spoken now. Return its start and end, or None.
 
         If the text is complete, the rest of it is one part. Blanks between parts are skipped.
 
@@ -163,7 +163,7 @@ class GrowingText:
         return float("inf")
 
     def _find_part_end(self, now: float, silent_at: float) -> int | None:
-        """Move the position past blanks. Return the end of the next part, if it can be spoken now.
+        """Skip blanks before the next part. Return its end, or None if it can't be spoken yet.
 
         Args:
             now: the current time.
@@ -190,10 +190,10 @@ class GrowingText:
                 return clause.end()
         if len(text) > longest:
             return _find_break(text, start, longest)
-        return _find_gap(text, start, longest) if waited == _LONG_WAIT else None
+        return _find_word_gap(text, start, longest) if waited == _LONG_WAIT else None
 
     def _find_sentence_end(self, waited: int) -> int | None:
-        """Return the end of the next complete sentence, if there is one.
+        """Return the end of the next sentence that counts as complete after this wait, if any.
 
         `waited` says how long the text has stayed the same. It is one of the constants such as `_SHORT_WAIT`.
         """
@@ -209,7 +209,7 @@ class GrowingText:
 
 
 def _required_wait(text: str, start: int, mark: re.Match[str]) -> int:
-    """Return how long to wait for more text before ending a sentence at a mark.
+    """Return the minimum wait for more text before a sentence may end at a mark.
 
     The sentence begins at `start`, and `mark` is a match of `_SENTENCE_END`. The result is one of the constants
     such as `_SHORT_WAIT`.
@@ -234,7 +234,7 @@ def _required_wait(text: str, start: int, mark: re.Match[str]) -> int:
 
 
 def _required_abbreviation_wait(text: str, next_start: int, kind: str) -> int:
-    """Return how long to wait for more text before ending a sentence at an abbreviation.
+    """Return the minimum wait for more text before a sentence may end at an abbreviation.
 
     `next_start` is the offset of the text after it, and `kind` is the name of its group in `_ABBREVIATION`.
     """
@@ -245,7 +245,7 @@ def _required_abbreviation_wait(text: str, next_start: int, kind: str) -> int:
     return _NEVER if _REST[kind].match(text, next_start) else _NO_WAIT
 
 
-def _find_gap(text: str, start: int, limit: int) -> int | None:
+def _find_word_gap(text: str, start: int, limit: int) -> int | None:
     """Return the offset of the last gap between words before `limit`, if any.
 
     The text before the gap must not be too short.
@@ -258,7 +258,7 @@ def _find_break(text: str, start: int, limit: int) -> int:
     """Return the best offset for breaking a long sentence before `limit`."""
     found = _CLAUSE_END.finditer(text, start + _CLAUSE_CHARS - 1, limit)
     clauses = [each.end() for each in found if each.end() < limit]
-    place = clauses[-1] if clauses else _find_gap(text, start, limit)
+    place = clauses[-1] if clauses else _find_word_gap(text, start, limit)
     if place is None:
         place = next((at for at in range(limit, start, -1) if _may_separate(text[at - 1], text[at])), limit)
     return place

@@ -52,7 +52,7 @@ class CannotStart(Exception):
 
 
 def start(configure: protocol.Configure, runner: GoalRunner) -> protocol.Ready:
-    """Start pyttsx3's engine and attach it to the runner. Return the `Ready` message.
+    """Start pyttsx3's engine and attach it to the runner. Return the `Ready` message for the server.
 
     Raises:
         CannotStart: a driver, a voice or a library is missing or unknown.
@@ -97,7 +97,7 @@ def _register_own_driver(synthesizer_name: str, driver_name: str, runner: GoalRu
 
 
 def register_driver(name: str, synthesizer: Synthesizer, runner: GoalRunner) -> None:
-    """Register a pyttsx3 driver for this synthesizer."""
+    """Register a pyttsx3 driver that speaks with this synthesizer."""
     module: Any = types.ModuleType(f"pyttsx3.drivers.{name}")
     module.buildDriver = lambda proxy: Driver(proxy, synthesizer, runner)
     sys.modules[module.__name__] = module
@@ -145,7 +145,7 @@ def _available_drivers() -> list[str]:
 
 
 def _make_run_loop_step(driver_name: str) -> Callable[[], None]:
-    """Return a function that runs macOS's event loop once. For other drivers, it does nothing."""
+    """Return a function that runs macOS's event loop once, or does nothing for other drivers."""
     if sys.platform != "darwin" or driver_name not in _RUN_LOOP_DRIVERS:
         return lambda: None
     from Foundation import NSDate, NSRunLoop  # type: ignore[import-not-found,unused-ignore]
@@ -216,7 +216,7 @@ class DriverProperties:
         self._voice = wanted
 
     def find_voice_id(self, wanted: str) -> str:
-        """Return the ID of the voice that best matches a name.
+        """Return the ID of the voice that best matches a name. Raise CannotSpeak if no voice does.
 
         Raises:
             CannotSpeak: there is no such voice.
@@ -287,7 +287,7 @@ class Driver:
             self._speak(text)
 
     def say(self, text: str) -> None:
-        """Store a text, which the next step of `iterate` speaks."""
+        """Store a text for the next step of `iterate` to speak."""
         self._proxy.setBusy(True)
         self._text = text
 
@@ -344,7 +344,7 @@ class Driver:
         except Exception as error:  # noqa: BLE001 - pyttsx3 would drop any exception
             self._proxy.notify("error", exception=error)
         runner.heard = round(playback.heard(), 3) if runner.duration is None else runner.duration
-        playback.silence()
+        playback.release_player()
         self._playback = None
         self._proxy.notify("finished-utterance", completed=runner.duration is not None)
 

@@ -33,7 +33,7 @@ def main() -> None:
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     # These imports take time. They come after `_die_with_parent`, because the server may exit in the meantime.
     from talkcli.engine.child.driver import CannotStart, start
-    from talkcli.engine.child.players.base import CannotEnd
+    from talkcli.engine.child.players.base import CannotKillPlayer
     from talkcli.engine.child.players.chooser import PlayerChooser
     from talkcli.engine.child.runner import Channel, GoalRunner
 
@@ -52,7 +52,7 @@ def main() -> None:
         runner.run(send_voices=configure.list_voices)
     except CannotStart as error:
         channel.send(error.failure)
-    except CannotEnd as error:  # the server detects that a player is still running, and starts another process
+    except CannotKillPlayer as error:  # the server detects that a player is still running, and starts another process
         sys.stderr.write(f"{error}\n")
     threading = sys.modules.get("threading")
     if threading and threading.active_count() > 1:  # a thread may still be loading a voice or running a model
@@ -86,7 +86,7 @@ def _limit_core_dump() -> None:
 
 
 def _limit_memory() -> None:
-    """Limit this process to half of the machine's memory.
+    """Limit this process to half of the machine's memory, or to 1 GiB if that is more.
 
     If a voice model needs more, the library reports an error. Without the limit, the machine would stall.
     """

@@ -10,7 +10,7 @@ import select
 import time
 from array import array
 
-from talkcli.engine.child.players.base import CannotEnd, CannotSpeak, Stopped
+from talkcli.engine.child.players.base import CannotKillPlayer, CannotSpeak, Stopped
 from talkcli.engine.child.words import TimedWord, WordClock
 from talkcli.engine.players import PIECE_S, SAMPLE_BYTES
 from talkcli.frozen import TYPE_CHECKING, replace
@@ -115,7 +115,7 @@ class SentenceSamples:
         """Return the number of zero bytes at the start of the buffer."""
         return (len(self._kept) - len(self._kept.lstrip(b"\0"))) // SAMPLE_BYTES * SAMPLE_BYTES
 
-    def part(self, begin: int, end: int) -> memoryview:
+    def view(self, begin: int, end: int) -> memoryview:
         """Return a view of the samples between two offsets.
 
         Release it before adding or dropping samples.
@@ -127,9 +127,9 @@ class SentenceSamples:
         del self._kept[: offset - self.begin]
         self.begin = offset
 
-    def trailing_silence(self, limit: int) -> int:
-        """Return the number of silent bytes at the end of the buffer, up to `limit`."""
-        return min(self._quiet, limit, len(self._kept))
+    def trailing_silence(self, max_bytes: int) -> int:
+        """Return the number of silent bytes at the end of the buffer, up to `max_bytes`."""
+        return min(self._quiet, max_bytes, len(self._kept))
 
 
 class PlayerFeed:
@@ -148,7 +148,7 @@ class PlayerFeed:
         self.player = player
         #: maximum number of bytes to offer at once
         self.piece_bytes = int(PIECE_S * rate) * SAMPLE_BYTES
-        #: number of bytes consumed at the last update, including silence
+        #: number of bytes consumed when the progress was last recorded, including silence
         self.consumed = 0
         #: number of bytes written to the player, including silence
         self.written = 0
@@ -165,7 +165,7 @@ class PlayerFeed:
         clock.reset(begin)
 
     def offer(self, samples: memoryview) -> int:
-        """Offer samples to the player and update the timing. Return the number of bytes accepted.
+        """Offer samples to the player and record its progress. Return the number of bytes accepted.
 
         The first samples start the clock.
         """
@@ -180,20 +180,20 @@ class PlayerFeed:
             self._heard_at = now + self.buffered(now)
         return taken
 
-    def offer_silence(self, position: float, max_bytes: int | None = None) -> int:
-        """Offer silence to the player before the next sample. Return the number of bytes accepted.
+    def offer_silence(self, audio_position: float, max_bytes: int | None = None) -> int:
+        """Offer silence to play before the next sample. Return the number of bytes accepted.
 
         Args:
-            position: position of that sample in the audio, in seconds.
+            audio_position: position of that sample in the audio, in seconds.
             max_bytes: maximum number of bytes to offer, or None for a whole piece.
         """
         taken = self.offer(memoryview(bytes(self.piece_bytes))[:max_bytes])
         if taken:
-            self._clock.add_silence(position, self._seconds(taken))
+            self._clock.add_silence(audio_position, self._seconds(taken))
         return taken
 
-    def update(self, now: float, *, all_written: bool) -> None:
-        """Adjust the word clock to the player's progress.
+    def record_progress(self, now: float, *, all_written: bool) -> None:
+        """Record how much the player has consumed, and adjust the word clock to its progress.
 
         Set `all_written` if nothing more will be written.
         """
@@ -215,19 +215,19 @@ class PlayerFeed:
         return max(0.0, self.time_left(self.written, now))
 
     def time_left(self, byte_count: int, now: float) -> float:
-        """Return how many seconds it takes until `byte_count` bytes have been heard.
+        """Return how many seconds remain until the stream's first `byte_count` bytes have been heard.
 
         The result is negative if they have already been heard.
         """
         return self._seconds(byte_count) - self._clock.elapsed(now)
 
     def silent_for(self, now: float) -> float:
-        """Return how long the player has had nothing to play, in seconds."""
+        """Return for how many seconds the player has had nothing to play."""
         if self.written == 0 or self.time_left(self.written, now) > MIN_PLAYER_BUFFER_S:
             return 0.0
         return max(0.0, now - self._heard_at)
 
-    def missing_seconds(self, now: float) -> float:
+    def unplayed_seconds(self, now: float) -> float:
         """Return how many seconds of audio would be lost if the player ended now."""
         return self.began_at + self._seconds(self.written) - now
 
@@ -246,7 +246,7 @@ class _PlayerReleased(Exception):
 class Playback:
     """Plays one sentence from the samples of a synthesizer.
 
-    All public methods except `stop` and `silence` may raise Stopped or CannotSpeak.
+    All public methods except `stop` and `release_player` may raise Stopped or CannotSpeak.
     """
 
     def __init__(self, runner: GoalRunner, on_word: Callable[[TimedWord], None]) -> None:
@@ -306,7 +306,7 @@ class Playback:
             fallback_reason: human-readable reason for a fallback voice, or None for the requested voice.
         """
         if self._feed is not None and rate != self._rate:
-            self._replace_player(0)  # the player was started with a different sample rate
+            self._release_and_continue_at(0)  # the player was started with a different sample rate
         self._rate = rate
         self._runner.report_voice(voice, fallback_reason)
         if self._players.takes_time and not self._runner.hold_number:
@@ -327,9 +327,7 @@ class Playback:
         self._clock.add(TimedWord(self._part_start + start, length, self._seconds(self._part_begin) + position))
 
     def write(self, samples: bytes) -> None:
-        """Send samples to the player, and wait until it has accepted them.
-
-        Silence at the end is held back.
+        """Send samples to the player, except silence at the end. Wait until it has accepted them.
 
         If all samples so far are silent, they are stored until the first sound follows.
         """
@@ -339,9 +337,9 @@ class Playback:
             self._with_player(self._send_all)
 
     def wait(self, descriptor: int) -> None:
-        """Keep playing until the descriptor is ready.
+        """Keep playing until the descriptor is readable. This method may return early.
 
-        This method may return early. If the player runs out of samples in the meantime, it doesn't count as stalled.
+        If the player runs out of samples in the meantime, it doesn't count as stalled.
         """
         self._in_background = True
         self._keep_playing([(descriptor, select.POLLIN)])
@@ -353,7 +351,7 @@ class Playback:
         self._part_start, self._part_begin, self._part_follows = start, self._samples.end, not is_last
 
     def buffered(self) -> float:
-        """Return how many seconds of sound the player still has to play.
+        """Return how many seconds of synthesized sound are still to be played.
 
         The result is 0 if the sound goes into a file.
         """
@@ -401,22 +399,22 @@ class Playback:
         if self._feed is not None:
             self._feed.player.kill()
 
-    def silence(self) -> None:
-        """Kill the player, and wait until it is silent.
+    def release_player(self) -> None:
+        """Kill the player, and wait until it is silent and has released its resources.
 
         Raises:
-            CannotEnd: the player has not exited in time.
+            CannotKillPlayer: the player has not exited in time.
         """
         if self._feed is None:
             return
         player = self._feed.player
         if player.proven:
-            self._players.update_output(player)
+            self._players.record_output(player)
         player.kill()
         deadline = time.monotonic() + PLAYER_KILL_LIMIT_S
         while not player.gone():
             if time.monotonic() >= deadline:
-                raise CannotEnd(f"{player.name} could not be stopped within {PLAYER_KILL_LIMIT_S:g} s")
+                raise CannotKillPlayer(f"{player.name} could not be stopped within {PLAYER_KILL_LIMIT_S:g} s")
             self._runner.wait(until=time.monotonic() + PIECE_S)
         if player.real_time and player.proven:
             self._players.silent_since = self._silent_at or time.monotonic()
@@ -425,7 +423,7 @@ class Playback:
     # -- choosing a player
 
     def _with_player(self, step: Callable[[PlayerFeed], None]) -> None:
-        """Call `step` with the current player. If that player fails, try the next one.
+        """Call `step` with the current player's feed. If that player fails, try the next one.
 
         The next player is tried only if no sound was heard yet, or if the sentence is paused. If the player was
         released during a pause, a new one is opened.
@@ -443,7 +441,7 @@ class Playback:
             except _PlayerReleased:
                 pass
             except CannotSpeak as error:
-                self._handle_player_error(error)
+                self._release_failed_player(error)
 
     def _open_next_player(self) -> PlayerFeed:
         """Open the next player, and return a feed that starts at the first unheard sample."""
@@ -454,8 +452,8 @@ class Playback:
         lead_in = self._players.lead_in_seconds(at_beginning=self._begin == self._skipped)
         return PlayerFeed(player, self._rate, self._clock, self._seconds(self._begin), lead_in)
 
-    def _handle_player_error(self, error: CannotSpeak) -> None:
-        """Release a failed player. Raise an error if no other player can replace it.
+    def _release_failed_player(self, error: CannotSpeak) -> None:
+        """Release the failed player, so that another can replace it. Raise an error if none can.
 
         There is no replacement if some of the sound may have been heard, or if no other player is left.
         """
@@ -471,9 +469,9 @@ class Playback:
         self._untried = iter(others) if others else None
         if lost or not (others or self._may_retry_busy_device(first)):
             if feed is not None:
-                self._players.update_output(feed.player)
+                self._players.record_output(feed.player)
             raise error if lost else first
-        self.silence()
+        self.release_player()
         if not others:
             self._wait(until=time.monotonic() + DEVICE_RETRY_INTERVAL_S)
 
@@ -484,16 +482,16 @@ class Playback:
         self._busy_until = self._busy_until or time.monotonic() + DEVICE_BUSY_LIMIT_S
         return time.monotonic() < self._busy_until
 
-    def _replace_player(self, resume_at: int) -> None:
-        """Kill the player. The best available player continues the sentence at `resume_at`."""
-        self._begin = self._sent = resume_at
+    def _release_and_continue_at(self, offset: int) -> None:
+        """Kill the player. The best available player will continue the sentence at this offset."""
+        self._begin = self._sent = offset
         self._untried = self._first_error = None
-        self.silence()
+        self.release_player()
 
     def _release_and_rewind(self, feed: PlayerFeed) -> None:
         """Kill a player. Rewind the sentence to the first sound that may be unheard."""
-        feed.update(time.monotonic(), all_written=False)
-        self._replace_player(self._unheard_begin() if feed.player.proven else self._begin)
+        feed.record_progress(time.monotonic(), all_written=False)
+        self._release_and_continue_at(self._unheard_begin() if feed.player.proven else self._begin)
 
     # -- steps
 
@@ -553,14 +551,14 @@ class Playback:
                 message = f"{player.name} did not exit within {DRAIN_LIMIT_S:g} s after the sound"
                 raise CannotSpeak(Reason.AUDIO_STALLED, message)
             self._wait_for_player(feed, deadline)
-        missing = feed.missing_seconds(time.monotonic())
+        missing = feed.unplayed_seconds(time.monotonic())
         if player.real_time and missing > EARLY_END_LIMIT_S - self._seconds(self._samples.end - self._sent):
             raise CannotSpeak(Reason.AUDIO_LOST, f"{player.name} ended {missing:.1f} s before the end of the sound")
 
     # -- samples
 
     def _skip_leading_zeros(self) -> bool:
-        """Skip silence before the first sound. Return False if playback must wait for more samples.
+        """Skip zeros that would delay the first sound. Return False if more samples are needed first.
 
         Zeros before the first sound are skipped, so that the sentence is heard earlier. They are kept in a file. They
         are also kept after another sentence, because they are part of the silence between the two sentences.
@@ -584,9 +582,9 @@ class Playback:
             taken = feed.offer_silence(self._seconds(self._begin), feed.lead_in)
             feed.lead_in -= taken
             return taken
-        with self._samples.part(self._sent, min(self._sendable_end(feed), self._sent + feed.piece_bytes)) as part:
+        with self._samples.view(self._sent, min(self._sendable_end(feed), self._sent + feed.piece_bytes)) as piece:
             silent = feed.silent_for(time.monotonic())
-            taken = feed.offer(part)
+            taken = feed.offer(piece)
         if taken and self._text_was_missing:
             self._text_was_missing = False
             feed.began_at += silent
@@ -614,11 +612,11 @@ class Playback:
         """Adjust the clock to the player's progress, drop heard samples, and report started words."""
         now = time.monotonic()
         sent_all = self._complete and self._sent == self._sendable_end(feed)
-        feed.update(now, all_written=sent_all and not self._runner.hold_number)
+        feed.record_progress(now, all_written=sent_all and not self._runner.hold_number)
         player = feed.player
         if not player.proven:
             return
-        self._players.update_output(player)
+        self._players.record_output(player)
         if feed.consumed:
             began_at = now - self._clock.elapsed(now)
             self._players.handovers.sentence_started(player.name, began_at, neural=self._in_background)
@@ -626,7 +624,7 @@ class Playback:
         self._report_words(self._clock.pop_started(now) if player.real_time else self._clock.pop_all())
 
     def _report_words(self, words: list[TimedWord]) -> None:
-        """Report words. Their positions are relative to the first sample played."""
+        """Report words with positions relative to the first sample played."""
         for word in words:
             self._on_word(replace(word, position=word.position - self._seconds(self._skipped)))
 
@@ -642,7 +640,7 @@ class Playback:
     # -- holding
 
     def _keep_silent(self, feed: PlayerFeed) -> None:
-        """Play silence while the sentence is paused, and confirm the pause to the server.
+        """Play silence until the pause ends, and confirm the pause to the server.
 
         Raises:
             _PlayerReleased: the player failed, or the pause is longer than `RELEASE_DELAY_S`.
@@ -661,7 +659,7 @@ class Playback:
             except CannotSpeak:
                 due = 0.0  # a player that fails during a pause is replaced
             if time.monotonic() >= due:
-                self._replace_player(self._sent)  # everything sent so far has been heard
+                self._release_and_continue_at(self._sent)  # everything sent so far has been heard
                 raise _PlayerReleased
             if not taken:
                 self._wait_for_player(feed, due)
@@ -729,7 +727,7 @@ class Playback:
     def _wait_for_player(
         self, feed: PlayerFeed, until: float, other_interests: Sequence[Interest] = (), *, has_samples: bool = True
     ) -> None:
-        """Wait until the player needs attention, a word is due or time is up.
+        """Wait until the player needs attention, a word is due, a descriptor is ready or time is up.
 
         Args:
             feed: the stream of the player.

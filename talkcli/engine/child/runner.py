@@ -90,7 +90,7 @@ class Channel:
 
 
 class ActiveGoal:
-    """The state of the goal that is being spoken."""
+    """The goal that is being spoken, with its text and its progress."""
 
     def __init__(self, command: protocol.Speak, now: float) -> None:
         self.id = command.id
@@ -132,7 +132,7 @@ class ActiveGoal:
         self.overdue_logged = False
 
     def append(self, command: protocol.Append, now: float) -> None:
-        """Add text to the goal, or mark its text as complete."""
+        """Add the text of an `Append` command. If it is the last, mark the goal's text as complete."""
         assert self.growing_text
         self.length += len(command.text)
         text = self._remove_markdown(command.text, ended=command.end)
@@ -285,7 +285,7 @@ class GoalRunner:
             self._engine.stop()
 
     def _stop_goal(self) -> None:
-        """Stop the current goal."""
+        """Stop the driver if it is speaking the current goal. Otherwise, end the goal as stopped."""
         if self._goal is not None and not self._goal.stop_requested:
             self._goal.stop_requested = True
             if self._goal.with_driver:
@@ -294,7 +294,7 @@ class GoalRunner:
                 self._end_goal(protocol.OUTCOME_STOPPED)
 
     def _send_voice_events(self) -> None:
-        """Send the server the latest events about neural voices."""
+        """Send the server all new events about neural voices."""
         loader = self._synthesizer.loader if self._synthesizer else None
         for event in loader.take_events() if loader else ():
             self._channel.send(event)
@@ -334,7 +334,7 @@ class GoalRunner:
             self._channel.send(protocol.Held(goal.id, self.hold_number))
 
     def _report_output(self) -> None:
-        """Tell the server about the output of the current goal, if it has changed."""
+        """Tell the server the device, volume and mute state of the goal's output if they have changed."""
         goal, output = self._goal, self.players.output
         if goal is not None and output != goal.reported_output:
             goal.reported_output = output
@@ -346,7 +346,7 @@ class GoalRunner:
         """Make a new goal the current one, and tell the server that it has started."""
         self._goal = ActiveGoal(command, time.monotonic())
         self.hold_number, self.duration, self.heard, self.gaps = 0, None, None, []
-        self.players.begin(command)
+        self.players.begin_goal(command)
         self._channel.send(protocol.Started(command.id))
 
     def _speak(self, goal: ActiveGoal) -> None:
@@ -489,7 +489,7 @@ def _make_markdown_reader() -> MarkdownReader:
 
 
 def _make_growing_text(text_so_far: str, command: protocol.Speak) -> GrowingText:
-    """Return the text of a goal as a `GrowingText`, to which more text can be added.
+    """Return a goal's text so far as a `GrowingText`, to which more text can be added.
 
     If the text broke off, an incomplete last sentence is left out.
     """

@@ -36,11 +36,11 @@ class CannotSpeak(Exception):
 
 
 class Stopped(Exception):
-    """Raised if the sentence was stopped."""
+    """Raised by the playback if the sentence was stopped."""
 
 
-class CannotEnd(Exception):
-    """Raised if a player couldn't be killed.
+class CannotKillPlayer(Exception):
+    """Raised if a killed player has not exited in time.
 
     The engine process must exit, because it can't guarantee silence.
     """
@@ -101,7 +101,7 @@ class Player(Protocol):
         """
 
     def heard(self) -> float | None:
-        """Return how many seconds of the stream have been heard, if the output has a clock.
+        """Return how many seconds of the stream have been heard, or None if the output has no clock.
 
         The result is 0 until the first sample is heard. If there is a clock, words and pauses follow it instead of
         `consumed`.

@@ -34,7 +34,7 @@ _MAX_WAV_BYTES = _UNKNOWN_BYTES - _WAV_HEADER.size
 
 
 class BuiltInPlayer(Player):
-    """Base class of players that process samples immediately."""
+    """Base class of players that need neither a program nor a sound server."""
 
     proven = True
 
@@ -89,7 +89,7 @@ class NullPlayer(BuiltInPlayer):
         self._end_time = 0.0
 
     def offer(self, data: memoryview) -> int:
-        """Accept all samples if the simulated buffer has room for them.
+        """Accept all samples if the simulated buffer has room for all of them, and otherwise none.
 
         Return the number of bytes accepted.
         """
@@ -115,7 +115,7 @@ class NullPlayer(BuiltInPlayer):
 
 
 class WavPlayer(BuiltInPlayer):
-    """Appends each sentence to a WAV file.
+    """Appends one sentence to a WAV file.
 
     The file is valid after every sentence, even if the sentence was stopped. The player only appends to files with the
     plain 44-byte header that it writes itself. It removes samples beyond the length in the header, which a crash may
@@ -137,7 +137,7 @@ class WavPlayer(BuiltInPlayer):
         with _convert_os_errors(Reason.AUDIO_DEVICE, f"{path} cannot be written"), contextlib.ExitStack() as opened:
             self._file = _open_regular_file(path)
             opened.callback(os.close, self._file)
-            self._start = _read_sample_bytes(self._file, path, rate)
+            self._start = _sample_byte_count(self._file, path, rate)
             os.ftruncate(self._file, _WAV_HEADER.size + self._start)
             self._write_header()
             opened.pop_all()
@@ -176,7 +176,7 @@ class WavPlayer(BuiltInPlayer):
 
 
 class WavStreamPlayer(BuiltInPlayer):
-    """Writes a WAV stream to a pipe, a device, or a file that the shell has opened.
+    """Writes a sentence to a WAV stream: a pipe, a device, or a file that the shell has opened.
 
     The stream contains all sentences. Its header has no valid lengths, because it can't be rewritten later. The program
     that reads the stream sets the pace. Other programs share the descriptor, so this player doesn't make it
@@ -208,7 +208,7 @@ class WavStreamPlayer(BuiltInPlayer):
         return written - header
 
     def interests(self) -> list[Interest]:
-        """Return the descriptor of the output."""
+        """Return the output's descriptor with the poll event POLLOUT."""
         return [(self._output, select.POLLOUT)]
 
     def wake_at(self) -> float:
@@ -226,7 +226,7 @@ def _convert_os_errors(reason: Reason, subject: str) -> Iterator[None]:
 
 
 def _open_regular_file(path: str) -> int:
-    """Open a file for reading and writing, or create it. Return its descriptor.
+    """Open or create a regular file for reading and writing. Return its descriptor.
 
     Raises:
         CannotSpeak: The path is empty, or isn't that of a regular file.
@@ -242,14 +242,14 @@ def _open_regular_file(path: str) -> int:
 
 
 def _header_fields(rate: int, sample_bytes: int) -> tuple[bytes | int, ...]:
-    """Return the fields of a WAV header for samples of this rate and size."""
+    """Return the fields of a WAV header for this sample rate and number of sample bytes."""
     audio_format = (1, 1, rate, rate * SAMPLE_BYTES, SAMPLE_BYTES, 8 * SAMPLE_BYTES)  # PCM, one channel
     riff_bytes = min(_UNKNOWN_BYTES, _RIFF_HEADER_BYTES + sample_bytes)
     return b"RIFF", riff_bytes, b"WAVE", b"fmt ", 16, *audio_format, b"data", sample_bytes
 
 
-def _read_sample_bytes(file: int, path: str, rate: int) -> int:
-    """Check the WAV header of a file. Return the number of sample bytes in the file.
+def _sample_byte_count(file: int, path: str, rate: int) -> int:
+    """Check the WAV header of a file. Return the number of sample bytes that it states.
 
     Raises:
         CannotSpeak: The file wasn't written by a `WavPlayer` with this sample rate.

@@ -45,7 +45,7 @@ MAX_HANDOVER_S = 0.5
 
 
 class HandoverTimes:
-    """Measures the delays between sentences. The silence between them is shortened to compensate.
+    """Measures the delays between sentences, and decides how much silence to cut to make up for them.
 
     A handover is the time between the last sample of one sentence and the first sample of the next. During a handover,
     the player drains and exits, the server gets the result, and the next sentence starts. This would lengthen the pause
@@ -136,17 +136,17 @@ class PlayerChooser:
             return
         yield from (partial(ProgramPlayer, command, self._inherited) for command in found)
 
-    def begin(self, command: Speak) -> None:
-        """Store the player settings of a `Speak` command."""
+    def begin_goal(self, command: Speak) -> None:
+        """Store the player settings of a new goal, and forget the previous goal's output."""
         self._own_lead_in = command.lead_in
         self._audible = self._configure.audible if command.audible is None else command.audible
         self.output = None
         self.handovers.next_waits, self.handovers.next_is_neural = command.next_waits, command.next_is_neural
 
-    def update_output(self, player: Player) -> None:
-        """Record the device, the volume and the mute state of a player's output.
+    def record_output(self, player: Player) -> None:
+        """Record the device, volume and mute state of a player's output, and which player works.
 
-        The player's name is recorded too if it works and was chosen automatically.
+        The player is recorded only if it was chosen automatically.
 
         A sentence that was ever muted counts as muted.
         """
@@ -173,7 +173,7 @@ class PlayerChooser:
         return milliseconds / 1000 if due else 0.0
 
     def find_first_player(self) -> str | None:
-        """Return the name of the player that the next sentence would use, if any.
+        """Find out which player the next sentence would use. Return its name, or None.
 
         Players that run in this process are opened and closed to test them.
         """
@@ -199,7 +199,7 @@ class PlayerChooser:
 
 
 def _open_in_process(name: str, rate: int, device: str | None = None, fail_if_muted: bool = False) -> Player:
-    """Open a player that runs in this process, by its name."""
+    """Open and return the player with this name, which runs in this process."""
     module, _, member = PLAYERS[name].class_path.partition(":")
     player_class = getattr(import_module(f"talkcli.engine.child.players.{module}"), member)
     player: Player = player_class(rate, device, fail_if_muted)

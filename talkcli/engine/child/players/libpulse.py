@@ -46,7 +46,7 @@ SIZE_ERROR = c_size_t(-1).value
 
 
 class PollDescriptor(Structure):
-    """The C structure `pollfd`."""
+    """The C structure `pollfd`: a descriptor and its poll events."""
 
     _fields_ = [("fd", c_int), ("events", ctypes.c_short), ("revents", ctypes.c_short)]
 
@@ -76,7 +76,7 @@ class BufferSizes(Structure):
 
 
 class SinkInfo(Structure):
-    """The first fields of the C structure `pa_sink_info`.
+    """The first fields of the C structure `pa_sink_info`, which describes a sink.
 
     Later versions of libpulse only append fields.
     """
@@ -203,7 +203,7 @@ class MainLoop:
         self.freed, self.interests, self.wake_at = True, [], NEVER
 
     def _poll(self, wanted: Any, count: int, timeout: int, _: object) -> int:
-        """Poll without waiting. Store the descriptors and the time that libpulse waits for."""
+        """Poll libpulse's descriptors without waiting. Store them and the time of its next timer."""
         self.interests = [(wanted[number].fd, wanted[number].events) for number in range(count)]
         self.wake_at = NEVER if timeout < 0 else time.monotonic() + timeout / 1000
         return max(0, int(self._library.poll(wanted, count, 0)))  # libpulse would abort the process after an error

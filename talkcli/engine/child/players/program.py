@@ -114,7 +114,7 @@ class PlayerProcess:
             self.exit = io.FileIO(os.pidfd_open(self.pid))
 
     def poll(self) -> int | None:
-        """Return the exit status, or None while the program runs. After its exit, kill leftover processes.
+        """Return the exit status, or None while the program runs. Kill processes that it left behind.
 
         This also reaps the program. If a signal killed it, the status is the negative number of the signal. The program
         counts as running until all processes that it has started have exited.
@@ -138,7 +138,7 @@ class PlayerProcess:
         if self._status is None:  # after the program is reaped, its process ID may be reused
             kill([-self.pid])
 
-    def await_end(self, seconds: float) -> None:
+    def await_exit(self, seconds: float) -> None:
         """Block until the program exits or the time is up.
 
         If the system can't report the exit, return at once.
@@ -203,7 +203,7 @@ class ErrorOutput:
         self._first: str | None = None
 
     def feed(self, data: bytes) -> None:
-        """Look for an error message in the program's error output."""
+        """Look for an error message in the next piece of the program's error output."""
         for line in self._lines.feed(data):
             self._examine_line(line)
 
@@ -230,7 +230,7 @@ class ErrorOutput:
 
 
 class ProgramPlayer(Player):
-    """Plays a sentence through the standard input of a program."""
+    """Plays a sentence by writing it to the standard input of a program."""
 
     real_time = True
 
@@ -313,7 +313,7 @@ class ProgramPlayer(Player):
         """Kill the program, and wait briefly for its exit."""
         self._process.kill()
         self._process.stdin.close()
-        self._process.await_end(REAP_WAIT_S)
+        self._process.await_exit(REAP_WAIT_S)
         self.gone()
 
     def gone(self) -> bool:
@@ -349,7 +349,7 @@ class ProgramPlayer(Player):
         return CannotSpeak(reason, line or f"{self.name} exited with status {status}")
 
     def _read_stderr(self) -> None:
-        """Read the program's new error output without blocking."""
+        """Read the program's new error output without blocking, and look for an error message in it."""
         stderr = self._process.stderr
         data = None if stderr.closed else stderr.read(65536)  # None if there is nothing to read
         if data:

@@ -197,7 +197,7 @@ class PulsePlayer(Player):
 
     @property
     def output(self) -> Output | None:
-        """The sink, its volume and its mute state, or None until the server reports them."""
+        """The sink, its volume and whether it was ever muted, or None until the server reports them."""
         sink, stream = self._sink_level, self._stream_level
         if self.device is None or sink is None or stream is None or self._is_volume_pending():
             return None
@@ -217,12 +217,12 @@ class PulsePlayer(Player):
             raise self._error
 
     def _run_libpulse(self) -> None:
-        """Run libpulse until there is no more work."""
+        """Run libpulse and advance the stream until there is no more work."""
         while self._loop.iterate() or self._advance_stream():
             pass
 
     def _advance_stream(self) -> bool:
-        """Open, update or drain the stream if it is time. Return whether to run libpulse again."""
+        """Open, check or drain the stream if this is due. Return whether to run libpulse again."""
         if self._error is not None or self._drained:
             return False
         state = self._lib.context_get_state(self._context)
@@ -267,7 +267,7 @@ class PulsePlayer(Player):
         return True
 
     def _follow_sink(self) -> bool:
-        """Check whether the sink was changed or suspended. Return whether requests were sent."""
+        """Record whether the sink was changed, muted or suspended. Return whether requests were sent."""
         index = int(self._lib.stream_get_device_index(self._stream))
         changed = index != self._sink_index
         if changed:
@@ -303,7 +303,7 @@ class PulsePlayer(Player):
         return True
 
     def _request_levels(self, *_: Any) -> None:
-        """Request the volumes of the sink and the stream."""
+        """Request the volume and mute state of the sink and of the stream."""
         self._pending_levels += 1
         sink, stream = self._sink_index, self._lib.stream_get_index(self._stream)
         self._release(self._lib.context_get_sink_info_by_index(self._context, sink, self._sink_callback, None))
@@ -344,7 +344,7 @@ class PulsePlayer(Player):
         self._clock_report, self._time_request_at = None, 0.0
 
     def _record_failure(self) -> None:
-        """Record that the stream has failed, and why."""
+        """Record why the stream has failed, unless an earlier error is recorded."""
         if self._error is not None:
             return
         reason = Reason.AUDIO_DEVICE if self._written == 0 else Reason.AUDIO_LOST
@@ -376,7 +376,7 @@ class PulsePlayer(Player):
         self._dry_at = self._written
 
     def _on_time(self, *_: Any) -> None:
-        """Store the playback time reported by the server."""
+        """Store the playback time reported by the server, or schedule another request for it."""
         if not self.proven:
             return  # before the stream has started, the reported time is only the delay of the answer
         heard, now = c_uint64(), time.monotonic()
@@ -386,7 +386,7 @@ class PulsePlayer(Player):
             self._time_request_at = now + TIME_REQUEST_S
 
     def _on_drained(self, _stream: int, success: int, _data: object) -> None:
-        """Record whether the server has played the whole stream."""
+        """Record that the server has played the whole stream, or that it has failed to do so."""
         if not success:
             self._record_failure()
             return
@@ -396,7 +396,7 @@ class PulsePlayer(Player):
         self._drained = self.proven = self._error is None
 
     def _on_sink(self, _context: int, found: Any, end: int, _data: object) -> None:
-        """Store the volume and mute state of the sink, as reported by the server."""
+        """Store the sink's volume and mute state, as reported by the server."""
         if end == 0 and found[0].index == self._sink_index:  # ignore a sink that the stream has left
             flat = bool(found[0].flags & libpulse.FLAT_VOLUME)
             self._sink_level = Level(libpulse.loudest(found[0].volume), bool(found[0].mute), flat)
@@ -405,7 +405,7 @@ class PulsePlayer(Player):
             self._level_refused = True
 
     def _on_stream(self, _context: int, found: Any, end: int, _data: object) -> None:
-        """Store the volume and mute state that the server reports for the stream."""
+        """Store the stream's volume and mute state, as reported by the server."""
         self._pending_levels -= end != 0
         if end == 0:
             self._stream_level = Level(libpulse.loudest(found[0].volume), bool(found[0].mute))
