@@ -71,7 +71,7 @@ class TimedOut(TalkError):
 
 
 class AddressInUse(TalkError):
-    """The server's socket is used by another server, or its directory is not safe."""
+    """The server's socket or the robot's name is already in use, or the socket's path is unsafe."""
 
     code = "address_in_use"
     exit_code = 11
@@ -115,7 +115,7 @@ class UnknownGoal(RequestRefused):
 
 
 class Busy(RequestRefused):
-    """The server has reached its limit of clients."""
+    """The server or the bridge has reached its limit of clients, or of unanswered requests."""
 
     code = "busy"
     exit_code = 5
@@ -132,7 +132,7 @@ class BadOption(RequestRefused):
 
 
 class BadRequest(RequestRefused):
-    """A client sent an invalid request. `code` says what is wrong."""
+    """A client's request is invalid or not allowed. `code` says what is wrong."""
 
     code = "bad_request"
 

@@ -43,7 +43,7 @@ _SYSTEM_PULSE = "/run/pulse"
 
 @frozen
 class PlayerCommand:
-    """The command line of a player program."""
+    """The command line of a player program, and how the program reads its input."""
 
     name: str
     argv: tuple[str, ...]
@@ -138,7 +138,7 @@ def is_silent(player: str | None) -> bool:
 
 
 def on_path(program: str, env: Mapping[str, str] | None = None) -> bool:
-    """Return whether a program is installed.
+    """Return whether a program is installed, given its name or its path.
 
     Args:
         program: The path or the name of the program. A name is searched for on the PATH.
@@ -179,7 +179,7 @@ def player_commands(
 
 
 def _parse_custom_command(player: str, device: str | None, rate: int) -> PlayerCommand:
-    """Return a custom player command with its placeholders filled in.
+    """Parse a custom player command, and fill in its placeholders.
 
     Raise PlayerMissing if it can't be run.
     """
@@ -241,7 +241,7 @@ def _config_home(env: Mapping[str, str]) -> str:
 
 
 def _has_default_server(path: str) -> bool:
-    """Return whether PulseAudio's client configuration names a server.
+    """Return whether a configuration file for PulseAudio's clients names a server.
 
     Debian's default file doesn't.
     """

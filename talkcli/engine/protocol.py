@@ -157,7 +157,7 @@ class Continue:
 
 @frozen
 class NextGoal:
-    """The command to update the information about the next goal in the queue.
+    """The command that reports whether another goal waits, and whether its voice is neural.
 
     It replaces `next_waits` and `next_is_neural` of the current goal.
     """
@@ -273,7 +273,7 @@ class Alive:
 
 @frozen
 class Word:
-    """The start of a word in the sound. The process sends this when the word is heard."""
+    """The position of a word in the text and in the sound, sent when the word is heard."""
 
     id: str
     start: int  # offset of the word's first character in the text
@@ -284,7 +284,7 @@ class Word:
 
 @frozen
 class TextMissing:
-    """The goal has fallen silent because the next text hasn't arrived, or it has resumed.
+    """The goal has fallen silent because the next text hasn't arrived, or it is speaking again.
 
     While the goal is silent, the event is repeated after long additions that can't be spoken yet.
     """
@@ -307,7 +307,7 @@ class OutputChanged:
 
 @frozen
 class VoiceChosen:
-    """The voice that speaks the sentence.
+    """The voice that speaks the goal.
 
     The process sends this again if a fallback voice replaces it before the first word.
     """
@@ -359,7 +359,7 @@ def encode(message: Command | Event) -> bytes:
 
 
 def decode(line: bytes, classes: Mapping[str, type[_M]]) -> _M:
-    """Parse a line of JSON. Return the message.
+    """Parse a line of JSON. Return a message of one of the given classes.
 
     Args:
         line: the line of JSON.

@@ -44,13 +44,11 @@ SYNTHESIZERS = {"espeak": "combined:CombinedSynthesizer"}
 
 
 class UnknownVoice(Exception):
-    """Raised if a voice can't be loaded. The message gives only the reason."""
+    """Raised if a voice or speaker is missing or can't be loaded. The message gives only the reason."""
 
 
 def is_own_driver(driver: str | None) -> bool:
-    """Return whether a driver is one of `talk`'s own synthesizers.
-
-    Those exist only on Linux.
+    """Return whether a driver is one of `talk`'s own synthesizers, which exist only on Linux.
 
     A built-in synthesizer plays through a player, while any other driver plays its sound itself.
     """
@@ -66,7 +64,7 @@ def list_voices(engine: Any) -> tuple[Voice, ...]:
 
 
 def find_voice(wanted: str, voices: tuple[Voice, ...], server_voice: str | None = None) -> Voice | None:
-    """Find a voice by name. Return it if exactly one voice matches.
+    """Find a voice by name. Return None unless exactly one voice matches.
 
     The name is compared with the ids, the last parts of the ids, the names and the languages of the voices, in this
     order, ignoring case. It may end with a variant ("en-us+f3"). The returned voice's id includes the variant. If
@@ -84,7 +82,7 @@ def find_voice(wanted: str, voices: tuple[Voice, ...], server_voice: str | None 
 
 
 def matching_languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
-    """Return the languages that match a language code or an English name."""
+    """Return the voices' languages that match a language code or an English language name."""
     known = {each.language for each in voices if each.language}
     word = _fold(wanted)
     region = _WITH_REGION.fullmatch(word)
@@ -97,7 +95,7 @@ def matching_languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
 
 
 def _matching_voices(wanted: str, voices: tuple[Voice, ...], server_voice: str | None = None) -> dict[str, Voice]:
-    """Return the voices that a name may refer to, by unambiguous name."""
+    """Return the voices that a name may refer to, each by its own unambiguous name."""
     for words in _possible_names(wanted, voices):
         fitting: dict[Voice, str] = {}
         for word in words:
@@ -147,7 +145,7 @@ def _languages_named(word: str, voices: Sequence[Voice]) -> list[str]:
 
 
 def _english_names(voice: Voice) -> list[str]:
-    """Return the English words for a voice's language.
+    """Return the English names of a voice's language.
 
     For "Chinese (Mandarin)", these are "Chinese" and "Mandarin".
     """
@@ -166,9 +164,9 @@ def _short_names(voice_id: str) -> list[str]:
 
 
 def _find_exact(wanted: str, voices: tuple[Voice, ...], server_voice: str | None = None) -> Voice | None:
-    """Find a voice by its exact name, ignoring case. Return None if there is none.
+    """Find a voice by its exact name, which may include a speaker or a variant. Ignore case.
 
-    The id of a neural voice may end with "#" and a speaker.
+    Return None if there is none. The id of a neural voice may end with "#" and a speaker.
     """
     if is_neural(wanted):
         name, mark, speaker = wanted.partition(SPEAKER_MARK)
@@ -224,7 +222,7 @@ def speaker_number(speaker: str, numbers_by_name: Mapping[str, int], speaker_cou
 
 
 def unknown_voice_message(wanted: str, voices: tuple[Voice, ...], other_driver: str | None = None) -> str:
-    """Return the error message for an unknown voice.
+    """Return the error message for an unknown or ambiguous voice name.
 
     It suggests similar voices, or says what to do next.
 
@@ -279,13 +277,13 @@ def _suggest_names(wanted: str, voices: tuple[Voice, ...]) -> list[str]:
 
 
 def _split_variants(voices: Sequence[Voice]) -> tuple[list[Voice], list[Voice]]:
-    """Return the ordinary voices, and the variants such as "+f3". Omit neural voices."""
+    """Split voices into ordinary voices and variants such as "+f3". Leave out neural voices."""
     plain = [each for each in voices if not each.id.startswith((VARIANT_PREFIX, NEURAL_PREFIX))]
     return plain, [each for each in voices if each.id.startswith(VARIANT_PREFIX)]
 
 
 def _find_by_name(wanted: str, voices: Sequence[Voice]) -> Voice | None:
-    """Find a voice by name, ignoring case. Return None if there is none.
+    """Find a voice by its id, name or language, ignoring case. Return None if there is none.
 
     If several voices match, prefer the one with the same spelling.
     """
@@ -300,7 +298,7 @@ def _find_by_name(wanted: str, voices: Sequence[Voice]) -> Voice | None:
 
 
 def _fold(word: str) -> str:
-    """Return a name in lower case and with hyphens, for comparisons."""
+    """Return a name in lower case, with hyphens instead of underscores, for comparisons."""
     return word.casefold().replace("_", "-")
 
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 class Fleet:
-    """All robots that are connected to the same broker.
+    """All robots that use the same broker.
 
     Most methods have an argument `to` that selects robots. It is the name of a robot, a pattern that matches names
     (`wh-*`), or a group (`@warehouse`). The group `@all` contains every robot.

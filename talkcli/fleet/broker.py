@@ -59,7 +59,7 @@ class Broker:
         return f"{'mqtts' if self.tls else 'mqtt'}://{host}:{self.port}"
 
     def ssl_context(self) -> ssl.SSLContext | None:
-        """Create an SSL context if the connection uses TLS.
+        """Create an SSL context. Return None if the connection doesn't use TLS.
 
         Raises:
             UsageError: a certificate or key file is unusable.
@@ -115,7 +115,7 @@ def require_paho() -> None:
 
 
 def client_user(broker: Broker) -> str:
-    """Return the user name for topics. It is the login's name or the local user's name.
+    """Return the user name for topics: the login's name, or else the local user's name.
 
     Raises:
         UsageError: the name isn't allowed in a topic.

@@ -68,9 +68,9 @@ class LocalConnection(ClientCore):
         self.connected(server, self._loop.time())
 
     async def read(self) -> list[bytes]:
-        """Wait for lines from the server. Return them without newlines.
+        """Wait for lines from the server. Return an empty list if the connection has ended.
 
-        If the connection has ended, return an empty list.
+        The lines are returned without newlines.
         """
         while not self._lines:
             await asyncio.sleep(0)  # let other tasks run even if data is always available
@@ -85,7 +85,7 @@ class LocalConnection(ClientCore):
         return lines
 
     def send(self, exchange: Exchange) -> bool:
-        """Send a request to the server, and expect an answer. Return False if the request is too long."""
+        """Send a request without waiting for the answer. Return False if the request is too long."""
         self.register(exchange, self._loop.time())
         line = self.line(exchange)
         if len(line) > MAX_LINE_BYTES:
@@ -108,7 +108,7 @@ class LocalConnection(ClientCore):
             self._socket.close()
 
     def abort(self) -> None:
-        """Shut down the connection. A waiting `read` then returns.
+        """Shut down the socket, so that a waiting `read` returns.
 
         The reader must then call `close`.
         """
@@ -116,7 +116,7 @@ class LocalConnection(ClientCore):
             self._socket.shutdown(_socket.SHUT_RDWR)
 
     def _flush(self) -> None:
-        """Send as much as possible without blocking.
+        """Send as much queued data as possible without blocking.
 
         Send the rest when the socket becomes writable.
         """

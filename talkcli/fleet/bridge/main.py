@@ -194,7 +194,7 @@ class Bridge:
             self.end(error)
 
     def _describe_status(self) -> str:
-        """Return the status line for systemd."""
+        """Return the bridge's status line for systemd."""
         broker = "online" if self._online else "OFFLINE"
         there = "server running" if self._publisher.server else "no server"
         pending = len(self._sessions.goals)
@@ -226,7 +226,7 @@ class Bridge:
                 log.write_limited("settings", f"{log.sanitize(str(error))}; the previous settings are used")
 
     async def _open_link(self, link: Link) -> None:
-        """Open a connection to the broker in a thread, without blocking the event loop."""
+        """Open a connection to the broker in a thread. Wait for it without blocking the event loop."""
         done = asyncio.Event()
         opener = LinkOpener(link, lambda: self._loop.call_soon_threadsafe(done.set))
         try:
@@ -293,13 +293,13 @@ class Bridge:
             self._descriptor = -1
 
     def _on_ready(self, action: Callable[[Link], None]) -> None:
-        """Call `action` to read from the link or write to it. Handle the link's new state."""
+        """Call `action` to read from the link or write to it. Then check the link."""
         if link := self._link:
             action(link)
-            self._handle_link_state(link)
+            self._check_link(link)
 
-    def _handle_link_state(self, link: Link) -> None:
-        """Clean up after a broken connection. Pause all sessions while the broker is slow.
+    def _check_link(self, link: Link) -> None:
+        """Clean up if the link is broken, and pause all sessions while the broker is slow.
 
         Close the link first if the broker accepts no data. Call this after each use of the link.
         """
@@ -337,7 +337,7 @@ class Bridge:
             log.write_limited("long", f"{words}: the broker accepts at most {link.max_payload_bytes:,}")
             return
         link.publish(message, qos, on_acknowledged or self._log_if_denied)
-        self._handle_link_state(link)
+        self._check_link(link)
 
     def _publish_to_all(self, message: Message) -> None:
         """Publish a status or an event if the robot is online. Drop events if the broker is slow."""
@@ -391,9 +391,10 @@ class Bridge:
                 self._send_echo()
 
     def _handle_echo(self, payload: bytes) -> None:
-        """Record a returned echo, or answer a bridge that asks whether the robot's name is in use.
+        """Record an echo, answer another bridge's question, or schedule going online.
 
-        If this bridge's own question returns, go online unless another bridge answers.
+        The question asks whether the robot's name is in use. If this bridge's own question returns, go online unless
+        another bridge answers.
         """
         if payload.startswith(_RIVAL_QUESTION):
             if payload != _RIVAL_QUESTION + self._session.encode():
@@ -458,7 +459,7 @@ class Bridge:
         self._publish(Message(self._echo_topic, f"{self._session} {self._echo_at}".encode()))
 
     def _tick(self) -> None:
-        """Every few seconds, send an echo, check for timeouts, and update the presence."""
+        """Check for timeouts, send an echo, and renew the presence if due. Schedule the next tick."""
         self._tick_timer = self._loop.call_later(ECHO_EVERY_S, self._tick)
         self._sessions.tick()
         self._publisher.tick()
@@ -466,7 +467,7 @@ class Bridge:
         if link is None:
             return
         link.tick()
-        self._handle_link_state(link)
+        self._check_link(link)
         # Compare sending times. If this process was stopped for a while, it hasn't read the returned echoes yet.
         if self._echo_at - self._policy.newest_echo_at > _ECHO_TIMEOUT_S:
             log.write_limited("echo", f"the broker does not return this robot's own messages; {_RIGHTS}")

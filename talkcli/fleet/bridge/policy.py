@@ -64,9 +64,7 @@ class RemoteRequest:
     start_by: float | None = None
 
     def build_say(self, goal_id: str, now: float) -> Say:
-        """Return the `say` request for the server, with a goal id and an adjusted TTL.
-
-        The message's expiry limits the TTL.
+        """Return the `say` request to send, with the goal's id and a TTL within the message's expiry.
 
         Args:
             goal_id: the goal's id.
@@ -82,7 +80,7 @@ class RemoteRequest:
 
 @frozen
 class Refusal:
-    """A refused request."""
+    """The error for a refused request, and the reply to the client."""
 
     error: RequestRefused
     #: the message that reports the error to the client; None if the client wants no answers
@@ -99,7 +97,7 @@ class Goodbye:
 
 @frozen
 class Ignored:
-    """A message that is logged but not answered."""
+    """A message that is only logged. It is neither carried out nor answered."""
 
     #: key for limiting how often similar messages are logged
     kind: str
@@ -128,9 +126,9 @@ class Policy:
         self.newest_echo_at = 0.0
 
     def record_echo(self, sent_at_text: bytes, now: float) -> None:
-        """Record the sending time of an echo, which is a message from the bridge to itself.
+        """Record when a returned echo was sent, if it is the newest.
 
-        Ignore it if its time is invalid or later than `now`.
+        An echo is a message from the bridge to itself. Ignore it if its time is invalid or later than `now`.
         """
         with contextlib.suppress(ValueError):
             sent_at = float(sent_at_text)
@@ -138,7 +136,7 @@ class Policy:
                 self.newest_echo_at = sent_at
 
     def decide(self, message: Message, kind: str, user: str, now: float) -> RemoteRequest | Refusal | Goodbye | Ignored:
-        """Check a message from the broker. Return how to handle it.
+        """Decide whether a message is accepted, refused or ignored, or ends its client's session.
 
         Args:
             message: a message on a request topic of the robot or one of its groups.
@@ -203,7 +201,7 @@ def _parse_request_fields(kind: str, payload: bytes) -> JsonObject:
 
 
 class SentIds:
-    """A record of recent goals: their ids, senders and servers.
+    """The ids of goals that remote clients sent recently, with their senders and servers.
 
     A server is identified by its boot id.
     """
@@ -214,11 +212,11 @@ class SentIds:
         self._sent: dict[str, tuple[str, str, bool]] = {}
 
     def boot_of(self, goal_id: str) -> str | None:
-        """Return the boot id of a goal's server. If the goal is unknown, return None."""
+        """Return the boot id of the server that got a goal. If the goal is unknown, return None."""
         return self._sent[goal_id][0] if goal_id in self._sent else None
 
     def user_of(self, goal_id: str) -> str | None:
-        """Return the name of a goal's sender. If the goal is unknown, return None."""
+        """Return the user name of a goal's sender. If the goal is unknown, return None."""
         return self._sent[goal_id][1] if goal_id in self._sent else None
 
     def is_counted(self, goal_id: str, boot: str) -> bool:
@@ -256,7 +254,7 @@ class RemoteGoals:
 
     @property
     def pending_count(self) -> int:
-        """Number of goals that the server has confirmed as pending."""
+        """The number of goals that the server has confirmed as pending."""
         return sum(pending for _, pending in self._goals.values())
 
     @staticmethod
@@ -265,7 +263,7 @@ class RemoteGoals:
         return not (say.preempt or say.flush)
 
     def has_room(self, say: Say) -> bool:
-        """Return whether a goal can be sent to the server without exceeding the limit for remote goals.
+        """Return whether a goal can be sent without exceeding the limit for remote goals.
 
         There is always room for a goal that replaces another goal with the same key.
         """
@@ -296,11 +294,11 @@ class RemoteGoals:
         self._goals[goal_id] = key, True
 
     def remove(self, goal_id: str) -> bool:
-        """Remove a goal that is no longer pending. Return whether it was counted."""
+        """Remove a goal that is no longer pending. Return whether it was recorded."""
         return self._goals.pop(goal_id, None) is not None
 
     def replace_pending(self, pending: Iterable[tuple[str, str | None]]) -> None:
-        """Replace all recorded pending goals. Each given pair is a goal's id and key.
+        """Replace the goals recorded as pending. Each pair in `pending` is a goal's id and key.
 
         Goals that are still on their way to the server are kept.
         """

@@ -154,7 +154,7 @@ class Publisher:
                 log.write_limited("line", f"the server sent a malformed message: {log.sanitize(str(error))}")
 
     def _on_watch_reply(self, server: LocalConnection, reply: JsonObject, items: list[JsonObject]) -> None:
-        """Store the server's state from its reply to `watch`, and report that the server is connected."""
+        """Store the server's status from its reply to `watch`, and report that it is connected."""
         status = ServerStatus.from_reply(reply, items)
         self._retry_s = _FIRST_SERVER_RETRY_S
         for each in unfinished(status):
@@ -165,7 +165,7 @@ class Publisher:
         self._set_server({**fields(server.server), "features": features}, status, server.boot)
 
     def _set_server(self, server_info: JsonObject | None, status: ServerStatus, boot: str) -> None:
-        """Store the new state of the server and its goals, and report the change."""
+        """Replace what is stored about the server and its goals, and report the change."""
         self.server = server_info
         self._active = status.active.id if status.active else None
         self._texts = {each.id: _shown_text(each) for each in unfinished(status)}
@@ -176,7 +176,7 @@ class Publisher:
         self.schedule_status()
 
     def _receive_event(self, server: LocalConnection, message: JsonObject, line: bytes) -> None:
-        """Update the state from an event, publish the event, and schedule the next status."""
+        """Process an event. If a goal's state or the pause changed, publish it and schedule a status."""
         event = from_json(message)
         if isinstance(event, StateChanged):
             self._update_goals(event)
@@ -195,7 +195,7 @@ class Publisher:
         self.schedule_status()
 
     def _update_goals(self, event: StateChanged) -> None:
-        """Update the active goal, the last goal and the texts from an event."""
+        """Update the stored active goal, last goal and texts from an event."""
         if event.state is State.PENDING:
             self._texts[event.id] = _shown_text(event.goal)
         elif event.state is State.ACTIVE:
@@ -206,7 +206,7 @@ class Publisher:
             self._last = event.goal or self._last
 
     def _add_text(self, event: TextAdded) -> None:
-        """Extend the stored beginning of a goal's text. Update the status if it shows the text."""
+        """Extend the stored start of a goal's text. If the status shows this text, schedule a status."""
         known = self._texts.get(event.id)
         if known and len(known) < _MAX_STATUS_TEXT_CHARS:
             self._texts[event.id] = (known + event.text)[:_MAX_STATUS_TEXT_CHARS]

@@ -114,7 +114,7 @@ class RemoteSessions:
             session.handle_goodbye()
 
     def end_all(self) -> None:
-        """End all sessions. Don't inform the clients, as the broker is disconnected."""
+        """End all sessions without informing their clients."""
         for session in list(self._sessions.values()):
             session.end()
         self.may_read.set()
@@ -174,7 +174,7 @@ class RemoteSessions:
             self._release_handle = self._loop.call_soon(self._send_or_cancel_waiting)
 
     def _send_or_cancel_waiting(self) -> None:
-        """Send waiting goals while there is room. If a client cancelled all goals, cancel them."""
+        """Send waiting goals while there is room, or cancel them if all pending goals were cancelled."""
         self._release_handle = None
         canceled_by, self._canceled_by = self._canceled_by, None
         if canceled_by and not self.goals.pending_count:
@@ -187,7 +187,7 @@ class RemoteSessions:
     # -- from the publisher
 
     def handle_goal_change(self, event: StateChanged, boot: str) -> None:
-        """Record the goal's state among the pending goals. Then send or cancel waiting goals."""
+        """Record whether a goal is now pending. Then schedule sending or cancelling waiting goals."""
         goal = event.goal
         if event.state is not State.PENDING:
             counted = self.goals.remove(event.id)
@@ -207,7 +207,7 @@ class RemoteSessions:
             self.ids.add(goal.id, boot, user)
 
     def reset_pending(self, pending: tuple[Goal, ...], boot: str) -> None:
-        """Replace the recorded pending goals with those of the server. Then send waiting goals."""
+        """Replace the recorded pending goals with the server's. Then schedule sending waiting goals."""
         self.goals.replace_pending((each.id, each.key) for each in pending if self.ids.is_counted(each.id, boot))
         self.handle_pending_change()
 
@@ -225,7 +225,7 @@ class _RemoteExchange(Exchange):
 
     @property
     def goal_id(self) -> str | None:
-        """The goal's id if the request is a `say`."""
+        """The goal's id if the request is a `say`, otherwise None."""
         return self.request.id if isinstance(self.request, Say) else None
 
 
@@ -264,11 +264,11 @@ class RemoteSession:
 
     @property
     def idle(self) -> bool:
-        """Whether the client isn't waiting for anything."""
+        """Whether the client is neither waiting for answers or results nor watching the server."""
         return not (self.unanswered or self._awaited or self._watching)
 
     def submit(self, request: RemoteRequest) -> None:
-        """Send a request, or queue it until the server is connected. Refuse excess requests."""
+        """Send a request, after connecting to the server if necessary. Refuse excess requests."""
         self.used_at = self._loop.time()
         if self._said_goodbye:  # the client has returned
             self._said_goodbye, self._reply_topic = False, request.reply_topic
@@ -332,7 +332,7 @@ class RemoteSession:
         return [request for request, _, session in self._sessions.waiting if session is self]
 
     def _drop_waiting(self) -> None:
-        """Drop the client's goals that are waiting for room."""
+        """Drop the client's goals that are waiting for room, without informing the client."""
         self._sessions.waiting = [each for each in self._sessions.waiting if each[2] is not self]
 
     def _end_if_done(self) -> None:
@@ -595,7 +595,7 @@ class RemoteSession:
 
 
 def _has_lasting_effect(remote_request: RemoteRequest) -> bool:
-    """Return whether a request must be carried out after its client has left.
+    """Return whether a request must be carried out even if its client has left.
 
     A `patient` goal is dropped in that case.
     """

@@ -213,7 +213,7 @@ class DeskLink:
         return self.link.publish(message, on_acknowledged=on_acknowledged)
 
     def end_session(self, to: str, *, is_group: bool = False) -> None:
-        """Tell the bridges of a robot or a group that no more requests will follow."""
+        """Tell the bridges of a robot or a group to end their sessions with this connection."""
         if self.link is not None:
             topic, response = self._topics(to, is_group=is_group)
             self.link.publish(Message(topic, b"", response=response), 0)

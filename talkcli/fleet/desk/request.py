@@ -46,7 +46,7 @@ class Selection:
 
     @property
     def fault(self) -> str | None:
-        """An error message if no robot can ever match."""
+        """An error message if no robot can ever match, otherwise None."""
         for kind, name in (("group", self.group), ("robot", self.name)):
             if name is not None:
                 fault = topics.name_fault(name)
@@ -73,7 +73,7 @@ class NoServer(ServerUnavailable):
 
 @frozen
 class Outcome:
-    """The outcome of a request on one robot.
+    """How a request ended on one robot: a state, an exit code, and the goal or the error.
 
     If the request affects several goals, the robot has one outcome for each of them.
 
@@ -113,7 +113,7 @@ def failure_outcome(robot: str, error: TalkError) -> Outcome:
 
 
 def reply_outcomes(robot: str, request: Request, reply: JsonObject, items: list[JsonObject]) -> list[Outcome]:
-    """Convert the server's reply to a list of outcomes.
+    """Convert the reply of a robot's server to a list of outcomes.
 
     Args:
         robot: the name of the robot.
@@ -142,7 +142,7 @@ def reply_outcomes(robot: str, request: Request, reply: JsonObject, items: list[
 
 
 def cancel_outcomes(robot: str, items: list[JsonObject], *, last: bool = True) -> list[Outcome]:
-    """Return the outcomes of a cancel request, one for each goal.
+    """Return the outcomes of a cancel request: one for each goal that it cancelled or found ended.
 
     Args:
         robot: the name of the robot.
