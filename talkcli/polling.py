@@ -1,6 +1,7 @@
 """A function that waits until file descriptors are ready or the time is up.
 
-Other descriptors can interrupt the wait.
+Other descriptors can interrupt the wait. A coroutine that waits with a `WaitReady` function works without an event
+loop, too: `run_blocking` runs it with `block_until_ready`, which blocks.
 """
 
 from __future__ import annotations
@@ -8,8 +9,12 @@ from __future__ import annotations
 from talkcli.frozen import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Awaitable, Callable, Coroutine, Mapping
+    from typing import Any, TypeVar
 
+    _T = TypeVar("_T")
+    #: A coroutine function with the parameters and the result of `wait_ready`.
+    WaitReady = Callable[[Mapping[int, int], float | None, Mapping[int, int] | None], Awaitable[set[int]]]
 
 #: The deadline of a wait without a time limit.
 NEVER = float("inf")
@@ -46,3 +51,21 @@ def wait_ready(
     if not found.isdisjoint(interrupt):
         raise Interrupted
     return found
+
+
+async def block_until_ready(
+    watched: Mapping[int, int], timeout: float | None, interrupt: Mapping[int, int] | None = None
+) -> set[int]:
+    """Call `wait_ready`, which blocks. Coroutines that run without an event loop use this function."""
+    return wait_ready(watched, timeout, interrupt)
+
+
+def run_blocking(coroutine: Coroutine[Any, Any, _T]) -> _T:
+    """Run a coroutine that blocks instead of suspending. Return its result."""
+    try:
+        coroutine.send(None)
+    except StopIteration as end:
+        result: _T = end.value
+        return result
+    coroutine.close()
+    raise AssertionError(f"{coroutine!r} has suspended")

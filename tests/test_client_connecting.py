@@ -68,7 +68,7 @@ class Waits:
         self.pauses: list[float] = []
         self.others: list[float] = []
         self._act, self._ready = act, polling.wait_ready
-        monkeypatch.setattr(connect, "wait_ready", self)
+        monkeypatch.setattr(polling, "wait_ready", self)
 
     def __call__(
         self, watched: Mapping[int, int], timeout: float, interrupt: Mapping[int, int] | None = None
@@ -102,7 +102,7 @@ def test_a_client_reaches_a_server_that_starts_while_it_tries(
     prepare(path)
     with contextlib.ExitStack() as stack:
         waits = Waits(monkeypatch, lambda n: stack.enter_context(serving(path, *greetings)) if n == 3 else None)
-        attempt = connect.connect(path, HELLO, keep_trying_s=60)
+        attempt = polling.run_blocking(connect.connect(path, HELLO, keep_trying_s=60))
         assert attempt.socket
         attempt.socket.close()
     assert len(waits.pauses) == 3 + len(greetings) - 1
@@ -123,7 +123,7 @@ def test_a_refused_client_does_not_try_again(
 ) -> None:
     waits = Waits(monkeypatch)
     with serving(path, greeting), pytest.raises(error):
-        connect.connect(path, HELLO, keep_trying_s=60)
+        polling.run_blocking(connect.connect(path, HELLO, keep_trying_s=60))
     assert waits.pauses == []
 
 
@@ -131,11 +131,11 @@ def test_an_unusable_socket_path_is_tried_once(path: str, monkeypatch: pytest.Mo
     waits = Waits(monkeypatch)
     os.makedirs(path)
     with pytest.raises(ServerUnavailable, match="a directory, not a socket"):
-        connect.connect(path, HELLO, keep_trying_s=60)
+        polling.run_blocking(connect.connect(path, HELLO, keep_trying_s=60))
     monkeypatch.setattr("talkcli.paths.client_sockets", lambda _: [f"{path}/s"])
     monkeypatch.setattr("talkcli.peers.credentials", lambda _: (1, os.getuid() + 1))
     with serving(f"{path}/s"), pytest.raises(AccessDenied, match="belongs to uid"):
-        connect.connect(None, HELLO, keep_trying_s=60)
+        polling.run_blocking(connect.connect(None, HELLO, keep_trying_s=60))
     assert waits.pauses == []
 
 
@@ -146,7 +146,7 @@ def test_a_refusal_at_one_socket_does_not_end_the_wait_for_another(path: str, mo
     with contextlib.ExitStack() as stack:
         stack.enter_context(serving(denied, refusal))
         Waits(monkeypatch, lambda _: stack.enter_context(serving(path, GREETING)))
-        attempt = connect.connect(None, HELLO, keep_trying_s=60)
+        attempt = polling.run_blocking(connect.connect(None, HELLO, keep_trying_s=60))
         assert attempt.socket
         attempt.socket.close()
     assert attempt.path == path

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli import Client, PausedChanged, StateChanged
-from talkcli.client.client import batches
+from talkcli.client.calls import batches
 from talkcli.client.connection import SocketConnection
 from talkcli.errors import (
     AccessDenied,

@@ -142,3 +142,27 @@ def test_a_goal_and_a_watch_are_lost_if_the_connection_ends(scripted: Scripted) 
     assert "that was all" in (handle.goal.message or "")
     with pytest.raises(Lost, match="at nowhere: that was all"):
         next(watch)
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError, ServerUnavailable])
+def test_a_saying_that_cannot_cancel_its_goal_raises_the_first_error(
+    scripted: Scripted, error: type[Exception]
+) -> None:
+    def fail() -> None:
+        scripted.end("that was all")
+        if error is ZeroDivisionError:
+            raise error
+
+    with pytest.raises(error), Client.over(scripted).saying("a"):
+        fail()
+
+
+def test_an_interrupted_saying_cancels_its_goal(scripted: Scripted, monkeypatch: pytest.MonkeyPatch) -> None:
+    def answer(exchange: Exchange, **_: object) -> None:
+        if isinstance(exchange.request, Say):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(scripted, "_answer", answer)
+    with pytest.raises(KeyboardInterrupt), Client.over(scripted).saying("a", id="mine"):
+        pass
+    assert scripted.requests == [Say("a", id="mine", wait=True), Cancel(("mine",))]

@@ -19,7 +19,7 @@ from talkcli.cli.interrupts import Interrupts
 from talkcli.client.connect import ConnectionAttempt, connect, hello, reach, send_early, yield_processor
 from talkcli.errors import AccessDenied
 from talkcli.paths import client_sockets
-from talkcli.polling import wait_ready
+from talkcli.polling import run_blocking, wait_ready
 from tests.conformance.bareserve import TALK, run
 from tests.support.connection import PATIENCE
 from tests.support.scripted_peer import GREETING, Peer, goal, result, serving
@@ -278,13 +278,13 @@ def test_a_server_that_refuses_the_client_is_skipped(early: bool) -> None:
             thread.start()
             stack.callback(thread.join, PATIENCE)
             stack.callback(listening.shutdown, socket.SHUT_RDWR)
-        line = connect(None, hello(None, urgent=False), attempt=attempt())
+        line = run_blocking(connect(None, hello(None, urgent=False), attempt=attempt()))
         assert (line.path, line.request_sent) == (second, b"")
         assert line.socket
         line.socket.close()
         os.unlink(second)
         with pytest.raises(AccessDenied, match=f"(?s)tried:\n  {first}: the server refused the connection: not you\n"):
-            connect(None, hello(None, urgent=False), attempt=attempt())
+            run_blocking(connect(None, hello(None, urgent=False), attempt=attempt()))
     assert set(heard) == {b'{"request": "hello"}\n'}, "the request is only for the server that admits the client"
 
 

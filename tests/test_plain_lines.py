@@ -17,7 +17,7 @@ from talkcli.cli.click_app import talk
 from talkcli.cli.command import COMMON_OPTIONS
 from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import CommonOptions
-from talkcli.client.client import check, too_long
+from talkcli.client.calls import check, too_long
 from talkcli.client.connect import GREETING_START
 from talkcli.goals.options import FLAG, Cancel, Say
 from talkcli.protocol import events

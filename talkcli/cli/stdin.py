@@ -20,6 +20,7 @@ from talkcli.cli.interrupts import Interrupts
 from talkcli.cli.show import note, retry_without_output, show_error, show_if_possible, write_error_line
 from talkcli.cli.wait import CANCEL_TIMEOUT_S, GoalReporter, seconds_left, timeout_error
 from talkcli.client.core import MIN_TTL_S
+from talkcli.client.goal import GoalHandle
 from talkcli.errors import EXIT_OK, Lost, ServerUnavailable, TalkError, TimedOut, UsageError
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.goal import Goal
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from typing import Any, TypeVar
 
     from talkcli.cli.show import CommonOptions
-    from talkcli.client.client import Client, GoalHandle
+    from talkcli.client.client import Client
     from talkcli.client.core import Exchange
 
     _T = TypeVar("_T")
@@ -402,7 +403,7 @@ class LineSpeaker(InputSpeaker):
             goal_options = {**goal_options, "ttl": max(MIN_TTL_S, round(line.expires_at - time.monotonic(), 2))}
         # Follow the goal even without --wait, to find out when it is no longer pending.
         request = Say(text, wait=True, feedback=self._feedback.shows_events, patient=True, **goal_options)
-        handle, accepted = self._client._create_handle(request)
+        handle, accepted = self._client._calls._create_handle(GoalHandle, request)
         if handle.state is State.REJECTED:
             self._report_rejected(line.number, handle.goal)
             return

@@ -17,7 +17,7 @@ from talkcli.errors import TalkError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import Say
 from talkcli.goals.states import State
-from talkcli.polling import wait_ready
+from talkcli.polling import run_blocking, wait_ready
 
 if TYPE_CHECKING:
     from talkcli.client.client import GoalHandle
@@ -74,7 +74,9 @@ class StreamSpeaker(InputSpeaker):
             if seconds_left(self._end) == 0:
                 raise timeout_error(self._timeout, "nothing was sent")
         assert isinstance(request, Say)
-        goal = self._speech._begin_goal(request)
+        run_blocking(self._speech._begin_goal(request))
+        goal = self._speech.goal
+        assert goal
         if goal.state is State.REJECTED:
             return retry_without_output(reporter.report_refused, goal.goal)
         if self._wait:
@@ -127,7 +129,7 @@ class StreamSpeaker(InputSpeaker):
         except TalkError as error:
             if self._speech._process_error(error):
                 self._feedback.note(error.message)
-                self._speech._break_off()
+                run_blocking(self._speech._break_off())
 
 
 def _has_news(goal: GoalHandle, exchange: Exchange | None) -> bool:

@@ -12,39 +12,25 @@ All errors except TimeoutError are subclasses of `talkcli.errors.TalkError`.
 
 from __future__ import annotations
 
-import os
-import time
-
+from talkcli.client.calls import ClientCalls, with_parameters_of
 from talkcli.client.connect import ANSWER_LIMIT_S
-from talkcli.client.connection import ReconnectingConnection, take_repeatedly
-from talkcli.client.core import EventBuffer
+from talkcli.client.connection import ReconnectingConnection
 from talkcli.client.goal import GoalHandle
-from talkcli.errors import Lost, UnknownGoal, UsageError
-from talkcli.frozen import TYPE_CHECKING, replace
-from talkcli.goals.goal import Goal
-from talkcli.goals.options import MAX_ID_CHARS, MAX_IDS, MAX_LOG_GOALS, STALL_S, Cancel, Say, Set, bad_option, key_error
-from talkcli.goals.states import State
-from talkcli.protocol.events import Canceled, ServerStatus, Snapshot, goal_in, goals
-from talkcli.protocol.lines import MAX_LINE_BYTES, request_line, request_to_json
-from talkcli.protocol.requests import Log, Pause, Resume, Status, Voices, Wait, Watch
+from talkcli.frozen import TYPE_CHECKING
+from talkcli.goals.options import STALL_S
+from talkcli.polling import run_blocking
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Callable, Coroutine, Iterable, Iterator
+    from typing import Any
 
     from talkcli.client.connection import Connection
-    from talkcli.client.core import OnReply
+    from talkcli.client.saying import Saying
     from talkcli.client.stream import SpeechStream
-    from talkcli.goals.goal import JsonObject
-    from talkcli.protocol.events import Event
+    from talkcli.goals.goal import Goal, JsonObject
+    from talkcli.protocol.events import Canceled, Event, ServerStatus
 
 __all__ = ["Client", "GoalHandle"]
-
-#: Number of bytes in a request that are reserved for everything except the list of ids.
-_RESERVED_LINE_BYTES = 4096
-#: The maximum size of an ASCII character, such as an escaped quote, and of any other character in JSON.
-_MAX_ASCII_BYTES, _MAX_CHARACTER_BYTES = 2, 12
-#: A `seq` that has more digits than any real one.
-_LONG_SEQ = 10**15
 
 
 class Client:
@@ -73,28 +59,25 @@ class Client:
             UsageError: the name is too long, or the timeout is not positive.
             ServerUnavailable, AccessDenied, Busy, ProtocolMismatch: there is no server that can be used.
         """
-        if not timeout > 0:
-            raise UsageError(f"the timeout must be more than 0, got {timeout!r}")
         self._connection: Connection = ReconnectingConnection(socket, name=name, patience_s=timeout)
-        #: the first server's boot id, which is prepended to ids that are only numbers
-        self._first_boot = self._connection.boot
+        self._calls = ClientCalls(self._connection)
 
     @classmethod
     def over(cls, connection: Connection) -> Client:
         """Return a client that uses an existing connection. This method is for internal use."""
         client = cls.__new__(cls)
-        client._connection, client._first_boot = connection, connection.boot
+        client._connection, client._calls = connection, ClientCalls(connection)
         return client
 
     @property
     def path(self) -> str:
         """The path of the server's socket."""
-        return self._connection.path
+        return self._calls.path
 
     @property
     def server_pid(self) -> int | None:
         """The server's process id."""
-        return self._connection.server.pid
+        return self._calls.server_pid
 
     def close(self) -> None:
         """Close the connection. Goals that were sent are still spoken."""
@@ -175,20 +158,25 @@ class Client:
             Interrupted: a patient goal was waiting for room, in one of `talk`'s own commands. The goal is not spoken if
                 the client is then closed, because the server notices that within 5 s.
         """
-        # The other parameters have the names of the request's fields.
-        given = {name: value for name, value in locals().items() if name not in {"self", "follow", "block"}}
-        request = Say(wait=follow or feedback, **given)
-        if not block and id is None:
-            request = replace(request, id=_new_goal_id())
-        handle, accepted = self._create_handle(request)
-        if handle.state.terminal:
-            return handle
-        if block:
-            self._connection.request(request, accepted)
-        else:
-            handle._set_request(request, time.monotonic())
-            self._connection.submit(request, accepted, handle._fail)
-        return handle
+        given = {name: value for name, value in locals().items() if name != "self"}
+        return run_blocking(self._calls._say(GoalHandle, **given))
+
+    @with_parameters_of(say)
+    def saying(self, text: str, **options: Any) -> Saying:
+        """Return a context manager that speaks a text until its block ends.
+
+            with talk.saying("please step back") as goal:
+                wait_until_path_is_free()
+
+        The goal is sent when the block begins. It is cancelled when the block ends, unless it has ended before. The
+        arguments and errors are those of `say`.
+
+        At the end of the block, the errors are those of `GoalHandle.cancel`. If an exception ends the block, it is
+        raised instead.
+        """
+        from talkcli.client.saying import Saying  # rarely needed, and slow to import
+
+        return Saying(self._calls, text, options)
 
     def stream(
         self,
@@ -232,13 +220,8 @@ class Client:
             UsageError: a value is out of its range.
             ProtocolMismatch: the server is too old for growing texts.
         """
-        given = {name: value for name, value in locals().items() if name != "self"}  # see `say`
-        say = Say("", wait=True, more=True, **given)
-        check(say)
-        if error := self._connection.unsupported(say):
-            raise error
-        if id is None and isinstance(self._connection, ReconnectingConnection):
-            say = replace(say, id=_new_goal_id())
+        given = {name: value for name, value in locals().items() if name != "self"}
+        say = self._calls._stream_request(**given)
         from talkcli.client.stream import SpeechStream  # rarely needed, and slow to import
 
         return SpeechStream(self._connection, say)
@@ -256,17 +239,7 @@ class Client:
             UsageError: an id is empty.
             UnknownGoal: the server doesn't know one of the goals.
         """
-        wanted = None if ids is None else [self._full_id(each) for each in ids]
-        handles: dict[str, GoalHandle] = {}
-
-        def accepted(_: JsonObject, items: list[JsonObject]) -> None:
-            for goal in goals(items, "goal"):
-                handles[goal.id] = GoalHandle(self._connection, goal)
-                handles[goal.id]._listen(feedback=feedback)
-
-        for some in [None] if wanted is None else batches(wanted):
-            self._connection.request(Wait(some, feedback), accepted)
-        return list(handles.values()) if wanted is None else [handles[each] for each in wanted]
+        return run_blocking(self._calls._follow(GoalHandle, ids, feedback=feedback))
 
     def cancel(
         self,
@@ -290,27 +263,11 @@ class Client:
             UsageError: an id or the key is not valid.
             UnknownGoal: an id is unknown. The other goals are cancelled, and are listed in the error's `items`.
         """
-        wanted = None if ids is None else [self._full_id(each) for each in ids]
-        first, *others = [None] if wanted is None else batches(wanted) or [()]
-        last = None if before is None else self._full_id(before)
-        requests = [Cancel(first, current, last, key), *map(Cancel, others)]
-        if key is not None and (fault := key_error(key)):
-            raise UsageError(fault)
-        items: list[JsonObject] = []
-        unknown: list[str] = []
-        for request in requests:
-            try:
-                items += self._connection.request(request)[1]
-            except UnknownGoal as error:
-                items += error.items
-                unknown.append(error.message)
-        if unknown:
-            raise UnknownGoal("\n".join(unknown), items=items)
-        return Canceled.from_items(items)
+        return run_blocking(self._calls.cancel(ids, current=current, before=before, key=key))
 
     def status(self) -> ServerStatus:
         """Return the state of the server, with its active, pending and recent goals."""
-        return ServerStatus.from_reply(*self._connection.request(Status()))
+        return run_blocking(self._calls.status())
 
     def goal(self, goal_id: str) -> Goal:
         """Return a goal in its current state. Raise UnknownGoal if the server doesn't know it.
@@ -319,8 +276,7 @@ class Client:
             UsageError: the id is empty.
             UnknownGoal: the server doesn't know the goal.
         """
-        reply, _ = self._connection.request(Status(self._full_id(goal_id)))
-        return Goal.from_json(reply.get("goal"))
+        return run_blocking(self._calls.goal(goal_id))
 
     def log(self, count: int = 20) -> list[Goal]:
         """Return the most recently ended goals, including REJECTED ones, oldest first.
@@ -331,10 +287,7 @@ class Client:
         Raises:
             UsageError: the count is out of its range.
         """
-        if not 0 < count <= MAX_LOG_GOALS:
-            raise UsageError(f"the count must be 1 to {MAX_LOG_GOALS:,}, got {count}")
-        _, items = self._connection.request(Log(count))
-        return list(goals(items, "goal"))
+        return run_blocking(self._calls.log(count))
 
     def voices(self) -> list[JsonObject]:
         """Return the voices of the server's engine.
@@ -343,8 +296,7 @@ class Client:
         word such as "medium". Its speakers are a list of names, or None if there is only one speaker. Other voices have
         None for both.
         """
-        _, items = self._connection.request(Voices())
-        return [each["voice"] for each in items if isinstance(each.get("voice"), dict)]  # type: ignore[misc]
+        return run_blocking(self._calls.voices())
 
     def settings(self) -> JsonObject:
         """Return the server's settings, which are the defaults for new goals.
@@ -380,11 +332,7 @@ class Client:
             UsageError: a value is out of its range.
             BadOption: the server refuses a value, for example a voice that its engine doesn't have.
         """
-        request = Set(rate, volume, voice, pitch, preempt, ttl)
-        check(request)
-        reply, _ = self._connection.request(request)
-        settings = reply.get("settings")
-        return settings if isinstance(settings, dict) else {}
+        return run_blocking(self._calls.set(rate, volume, voice, pitch, preempt, ttl))
 
     def pause(self) -> Goal | None:
         """Pause all speech, and wait until it has stopped. Return the paused goal, if any.
@@ -392,14 +340,14 @@ class Client:
         Return None if no goal was being spoken. Nothing is spoken until any client calls `resume`. Pausing twice is no
         error.
         """
-        return goal_in(self._connection.request(Pause())[0])
+        return run_blocking(self._calls.pause())
 
     def resume(self) -> Goal | None:
         """Resume speech. Return the resumed goal, if any.
 
         Return None if no goal was paused. Resuming twice is no error.
         """
-        return goal_in(self._connection.request(Resume())[0])
+        return run_blocking(self._calls.resume())
 
     def events(self, *, reconnect: bool = False) -> Iterator[Event]:
         """Iterate over the events of all goals, starting now.
@@ -416,114 +364,10 @@ class Client:
         Raises:
             Lost: the connection broke and `reconnect` is False, or more than 10,000 states were not read in time.
         """
-        buffer = EventBuffer(reconnects=reconnect)
-
-        def accepted(reply: JsonObject, items: list[JsonObject]) -> None:
-            buffer.add(Snapshot(ServerStatus.from_reply(reply, items)))
-            self._connection.listeners.watches.add(buffer)
-
-        self._connection.request(Watch(), accepted)
-        return self._take_all(buffer)
-
-    # -- internal
-
-    def _create_handle(self, request: Say) -> tuple[GoalHandle, OnReply]:
-        """Check a `say` request. Return its goal's handle, and the function to call with the reply.
-
-        If the text is too long for a request, the goal is already REJECTED.
-
-        Raises:
-            UsageError: a value is out of its range.
-        """
-        check(request)
-        handle = GoalHandle(self._connection, too_long(request) or Goal("", State.PENDING))
-
-        def accepted(reply: JsonObject, _: list[JsonObject]) -> None:
-            handle._accept(reply)
-            if request.wait:
-                handle._listen(feedback=request.feedback)
-
-        return handle, accepted
-
-    def _full_id(self, goal_id: str) -> str:
-        """Check a goal id, and add the boot id if it is missing. Return the full id.
-
-        Raises the same errors as `check_id`.
-        """
-        if goal_id.isascii() and goal_id.isdecimal():
-            goal_id = f"{self._first_boot}-{goal_id}"
-        check_id(goal_id)
-        return goal_id
-
-    def _take_all(self, buffer: EventBuffer) -> Iterator[Event]:
-        """Yield a buffer's events as they arrive. Raise Lost when the stream of events ends."""
-        for event in take_repeatedly(self._connection, lambda: buffer.take() or buffer.closed, None):
-            if event is None or isinstance(event, str):
-                break
-            yield event
-        why = f"no more events from the server at {self.path}: {self._connection.ended}"
-        raise Lost(buffer.closed or why)
+        return _repeat(run_blocking(self._calls._watch(reconnect=reconnect)))
 
 
-def _new_goal_id() -> str:
-    """Return a new random goal id."""
-    return f"talk:{os.urandom(8).hex()}"
-
-
-def check_id(goal_id: str) -> None:
-    """Raise an error if no goal can have this id.
-
-    Raises:
-        UsageError: the id is empty.
-        UnknownGoal: the id is too long for any goal.
-    """
-    if not goal_id:
-        raise UsageError("the goal's id is empty; check the variable that should contain it")
-    if len(goal_id) > MAX_ID_CHARS:
-        raise UnknownGoal(f"unknown goal {goal_id[:MAX_ID_CHARS]!a}…: an id has at most {MAX_ID_CHARS} characters")
-
-
-def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
-    """Return the ids without duplicates, in groups that each fit into one request."""
-    groups: list[list[str]] = []
-    room = 0
-    for each in dict.fromkeys(ids):
-        plain = each.isascii() and each.isprintable()
-        size = (_MAX_ASCII_BYTES if plain else _MAX_CHARACTER_BYTES) * len(each) + len('"", ')
-        if not groups or size > room or len(groups[-1]) == MAX_IDS:
-            groups.append([])
-            room = MAX_LINE_BYTES - _RESERVED_LINE_BYTES
-        room -= size
-        groups[-1].append(each)
-    return [tuple(each) for each in groups]
-
-
-def check(request: Say | Set) -> None:
-    """Raise UsageError if an option of a request is invalid."""
-    for option in request.options:
-        try:
-            fault = option.type_error(getattr(request, option.name))
-        except (TypeError, ValueError) as error:  # `data` contains a value that JSON can't represent
-            fault = f"can't be sent as JSON: {error}"
-        if fault:
-            raise UsageError(f"{option.name!r} {fault}")
-    if words := bad_option(request):
-        raise UsageError(words)
-
-
-def too_long(request: Say) -> Goal | None:
-    """Return a REJECTED goal if a text is too long for a request. Otherwise, return None.
-
-    Raises:
-        UsageError: `data` has no JSON form.
-    """
-    try:
-        line = request_line({"seq": _LONG_SEQ, **request_to_json(request)})
-    except ValueError as error:  # `data` contains NaN or an infinite number
-        raise UsageError(f"'data' can't be sent as JSON: {error}") from None
-    if len(line) <= MAX_LINE_BYTES:
-        return None
-    from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
-
-    message = f"not spoken: the text is too long for a request ({len(request.text):,} characters)"
-    return Goal("", State.REJECTED, request.text, reason=Reason.TEXT_TOO_LONG.value, message=message)
+def _repeat(next_event: Callable[[], Coroutine[Any, Any, Event]]) -> Iterator[Event]:
+    """Call a coroutine function again and again. Yield its results."""
+    while True:
+        yield run_blocking(next_event())

@@ -16,15 +16,16 @@ import os
 import time
 
 from talkcli import paths, peers
-from talkcli.errors import AccessDenied, Busy, ServerUnavailable, TalkError
+from talkcli.errors import AccessDenied, Busy, ServerUnavailable, TalkError, UsageError
 from talkcli.frozen import TYPE_CHECKING, frozen, replace
-from talkcli.polling import wait_ready
+from talkcli.polling import block_until_ready
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from talkcli.client.core import ServerInfo
     from talkcli.goals.goal import JsonObject
+    from talkcli.polling import WaitReady
 
 #: How the greeting of a server with the same protocol begins. A test compares this with a real greeting.
 GREETING_START = b'{"talk": 1, "version": '
@@ -188,7 +189,7 @@ def hello(name: str | None, *, urgent: bool) -> JsonObject:
     return {"request": "hello", **({"name": name} if name else {}), **({"urgent": True} if urgent else {})}
 
 
-def connect(
+async def connect(
     named_path: str | None,
     hello: JsonObject,
     patience_s: float = ANSWER_LIMIT_S,
@@ -196,6 +197,7 @@ def connect(
     attempt: ConnectionAttempt | None = None,
     keep_trying_s: float = 0.0,
     greeting_deadline: float | None = None,
+    wait: WaitReady = block_until_ready,
 ) -> ConnectionAttempt:
     """Connect to the first usable server, and read its greeting. Return the connection.
 
@@ -212,11 +214,15 @@ def connect(
             `patience_s`, the server may use the rest of it for its greeting.
         greeting_deadline: with `keep_trying_s`, the monotonic time by which the server must have sent its greeting.
             None for no limit.
+        wait: waits until descriptors are ready. By default, it blocks.
 
     Raises:
+        UsageError: `patience_s` is not positive.
         ServerUnavailable, AccessDenied, ProtocolMismatch, Busy: there is no server that can be used.
         Interrupted: one of the interrupting descriptors is ready.
     """
+    if not patience_s > 0:
+        raise UsageError(f"the timeout must be more than 0, got {patience_s!r}")
     give_up = time.monotonic() + (keep_trying_s or patience_s)
     attempt = attempt or reach(named_path)
     while True:
@@ -227,7 +233,7 @@ def connect(
             if keep_trying_s and greeting_deadline is not None:
                 greet_by = min(greet_by, greeting_deadline)
             try:
-                return _greet(attempt, hello, greet_by, interrupt)
+                return await _greet(attempt, hello, greet_by, interrupt, wait)
             except AccessDenied as denied:
                 if attempt.request_sent:
                     raise
@@ -243,7 +249,7 @@ def connect(
             raise error or unreachable_error(attempt, named_path)
         import random  # rarely needed, and slow to import
 
-        wait_ready({}, min(random.uniform(*RETRY_PAUSE_S), left), interrupt)
+        await wait({}, min(random.uniform(*RETRY_PAUSE_S), left), interrupt)
         attempt = reach(named_path)
 
 
@@ -253,8 +259,12 @@ def _server_may_start(attempt: ConnectionAttempt) -> bool:
     return not found.isdisjoint({paths.PLACE_ABSENT, paths.PLACE_STALE})
 
 
-def _greet(
-    attempt: ConnectionAttempt, hello: JsonObject, deadline: float, interrupt: Mapping[int, int] | None
+async def _greet(
+    attempt: ConnectionAttempt,
+    hello: JsonObject,
+    deadline: float,
+    interrupt: Mapping[int, int] | None,
+    wait: WaitReady,
 ) -> ConnectionAttempt:
     """Send the hello message if necessary, and read the server's greeting. Return the updated attempt.
 
@@ -279,7 +289,7 @@ def _greet(
             except (BrokenPipeError, ConnectionResetError):
                 pass  # the server has closed the connection, but its error message can still be read
         while b"\n" not in received:
-            if not wait_ready({connected.fileno(): POLLIN}, deadline - time.monotonic(), interrupt):
+            if not await wait({connected.fileno(): POLLIN}, deadline - time.monotonic(), interrupt):
                 listener, _ = peers.credentials(connected)
                 hint = f"check process {listener}, and restart it if it hangs"
                 raise ServerUnavailable(f"the server at {attempt.path} doesn't respond; {hint}")

@@ -18,13 +18,13 @@ from talkcli.client.core import MAX_UNSENT_BYTES, ClientCore, Exchange
 from talkcli.errors import ProtocolMismatch, ServerUnavailable, TalkError, UsageError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import MAX_SENDER_NAME_CHARS, Cancel, Say
-from talkcli.polling import wait_ready
+from talkcli.polling import NEVER, run_blocking, wait_ready
 from talkcli.protocol.lines import request_line
 
 if TYPE_CHECKING:
     import _socket
-    from collections.abc import Callable, Iterator, Mapping
-    from typing import TypeVar
+    from collections.abc import Callable, Collection, Coroutine, Mapping
+    from typing import Any, TypeVar
 
     from talkcli.client.connect import ConnectionAttempt
     from talkcli.client.core import OnFailure, OnReply
@@ -48,11 +48,13 @@ def checked_sender_name(name: str | None) -> str | None:
     return name
 
 
-def take_repeatedly(connection: Connection, take: Callable[[], _T], deadline: float | None) -> Iterator[_T]:
-    """Call `take` again and again, and yield its results. Wait for the server if there are none.
+def event_reader(
+    connection: Connection, take: Callable[[], _T], deadline: float | None
+) -> Callable[[], Coroutine[Any, Any, _T]]:
+    """Return a coroutine function that returns the next result of `take`, and waits for the server if there is none.
 
-    An empty result is yielded if `deadline` has passed or the connection has ended. Nothing more is received after
-    `deadline`, so that a loop over the results ends even if the server keeps sending events.
+    Its result is false if `deadline` has passed or the connection has ended. Nothing more is received after `deadline`,
+    so that a loop over the results ends even if the server keeps sending events.
 
     Args:
         connection: the connection to wait for.
@@ -61,21 +63,24 @@ def take_repeatedly(connection: Connection, take: Callable[[], _T], deadline: fl
         deadline: monotonic time; None for no limit.
     """
     found: _T
+    late = False
 
     def arrived() -> bool:
         nonlocal found
         found = take()
         return bool(found)
 
-    late = False
-    while True:
+    async def read() -> _T:
+        nonlocal late
         if late:
             with connection.changed:
                 arrived()
         else:
-            connection.wait_until(arrived, deadline)
+            await connection.until(arrived, deadline)
             late = deadline is not None and time.monotonic() >= deadline
-        yield found
+        return found
+
+    return read
 
 
 class Connection(ClientCore):
@@ -92,6 +97,10 @@ class Connection(ClientCore):
     ServerUnavailable. Events that were received before can still be read.
     """
 
+    #: whether the connection is opened again after a break
+    reconnects = False
+    #: descriptors that interrupt any wait, with their poll events
+    _interrupt: Mapping[int, int] | None = None
     #: id of the process that listens at the socket, or None if the server is on another machine
     listener_pid: int | None = None
     #: the class that `begin` uses for exchanges
@@ -130,6 +139,13 @@ class Connection(ClientCore):
             self.changed.notify_all()
 
     def request(self, request: Request, on_reply: OnReply | None = None) -> tuple[JsonObject, list[JsonObject]]:
+        """Send a request, and block until it is answered. Return the reply and the items of its list.
+
+        The arguments and errors are those of `ask`.
+        """
+        return run_blocking(self.ask(request, on_reply))
+
+    async def ask(self, request: Request, on_reply: OnReply | None = None) -> tuple[JsonObject, list[JsonObject]]:
         """Send a request, and wait for the answer. Return the reply and the items of its list.
 
         Args:
@@ -148,12 +164,20 @@ class Connection(ClientCore):
         # `say` can be interrupted, because closing the connection cancels a goal that is waiting for room in the queue.
         interruptible = exchange.unlimited or not isinstance(request, Say)
         try:
-            self.wait_until(lambda: exchange.over, None, interruptible=interruptible)
+            await self.until(lambda: exchange.over, None, interruptible=interruptible)
         finally:
             with self.changed:
-                if not self.forget(exchange):
-                    self._cut_off()
+                self._stop_waiting(exchange)
         return self.answer(exchange)
+
+    def _stop_waiting(self, exchange: Exchange) -> None:
+        """Drop an exchange, whether or not it has been answered."""
+        if not self.forget(exchange):
+            self._cut_off()
+
+    def new_goal_id(self) -> str:
+        """Return a new random id for a goal that this client sends."""
+        return f"talk:{os.urandom(8).hex()}"
 
     def begin(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> Exchange:
         """Send a request without waiting for the answer. Return the exchange.
@@ -191,6 +215,13 @@ class Connection(ClientCore):
             if self.ended is not None:
                 raise ServerUnavailable(f"nothing was sent to the server at {self.path}: {self.ended}")
             self.begin(request, on_reply, on_failure)
+
+    async def until(self, done: Callable[[], bool], deadline: float | None, *, interruptible: bool = True) -> bool:
+        """Wait as `wait_until` does. Coroutines call this method.
+
+        A connection that runs in an event loop suspends the coroutine. Other connections block.
+        """
+        return self.wait_until(done, deadline, interruptible=interruptible)
 
     def wait_until(
         self,
@@ -265,7 +296,22 @@ class Connection(ClientCore):
         """
         self.break_off(f"the server accepted no data for {self._patience:g} s", time.monotonic())
 
-    # -- methods that each transport implements. Callers of `_send` and `_hang_up` hold the lock `changed`.
+    def _step(self, timeout: float, interruptible: bool) -> None:
+        """Send waiting requests, wait up to `timeout` seconds for messages, and process them.
+
+        Only one thread at a time may call this method.
+
+        Raises:
+            Interrupted: the wait is `interruptible`, and one of the interrupting descriptors is ready.
+        """
+        with self.changed:
+            now = time.monotonic()
+            watched, due = self.prepare(now)
+        if not watched:
+            timeout = min(timeout, _RECONNECT_PAUSE_S)
+        self.process(wait_ready(watched, max(0.0, min(timeout, due - now)), self._interrupt if interruptible else None))
+
+    # -- methods that each transport implements. Callers of `_send`, `prepare` and `_hang_up` hold the lock `changed`.
 
     def _send(self, exchange: Exchange) -> None:
         """Send an exchange's request, or queue it for later.
@@ -275,13 +321,18 @@ class Connection(ClientCore):
         """
         raise NotImplementedError
 
-    def _step(self, timeout: float, interruptible: bool) -> None:
-        """Send waiting requests, wait up to `timeout` seconds for messages, and process them.
+    def prepare(self, now: float) -> tuple[dict[int, int], float]:
+        """Do what is due, such as sending and reconnecting, without blocking. Return what to wait for.
 
-        Only one thread at a time may call this method.
+        Returns:
+            The poll events by descriptor, and the monotonic time at which to call `process` even if nothing is ready.
+        """
+        raise NotImplementedError
 
-        Raises:
-            Interrupted: the wait is `interruptible`, and one of the interrupting descriptors is ready.
+    def process(self, ready: Collection[int]) -> None:
+        """Process the messages that have arrived, without blocking.
+
+        `ready` are those of the descriptors from the last call of `prepare` that are ready.
         """
         raise NotImplementedError
 
@@ -323,7 +374,8 @@ class SocketConnection(Connection):
                 clients.
             interrupt: descriptors that interrupt any wait, with their poll events, as in `polling.wait_ready`.
             patience_s: seconds in which the server must send its greeting, and must answer each request.
-            attempt: an open connection, on which the first request may have been sent.
+            attempt: an open connection, on which the first request may have been sent. If its greeting has been read,
+                nothing blocks.
             keep_trying_s: seconds for which to try again if there is no server yet. After connecting, the rest of this
                 time is the limit for each answer, unless `patience_s` is longer.
             end: with `keep_trying_s`, the monotonic time by which the server must have sent its greeting. None for no
@@ -334,10 +386,14 @@ class SocketConnection(Connection):
         self._hello_message = hello(checked_sender_name(name), urgent=urgent)
         self._named = paths.named_socket(socket)
         give_up = time.monotonic() + keep_trying_s
-        attempt = connect(self._named, self._hello_message, patience_s, self._interrupt, attempt, keep_trying_s, end)
+        if not (attempt and attempt.server):
+            options = patience_s, interrupt, attempt, keep_trying_s, end
+            attempt = run_blocking(connect(self._named, self._hello_message, *options))
         self._patience = max(patience_s, round(give_up - time.monotonic(), 1))
         #: the socket, or None while disconnected
         self._socket: _socket.socket | None = attempt.socket
+        #: the socket that a thread may be polling. Only that thread closes it.
+        self._polled: _socket.socket | None = None
         assert attempt.server
         self.path, self.server = attempt.path, attempt.server
         self._sent_early = attempt.request_sent
@@ -372,33 +428,36 @@ class SocketConnection(Connection):
             if self.greeted:
                 self.stop_sending(f"the connection to the server was lost: {error.strerror}")
 
-    def _step(self, timeout: float, interruptible: bool) -> None:
-        """Send waiting requests, wait up to `timeout` seconds for data, and process it."""
-        with self.changed:
-            early, self._received_early = self._received_early, b""
-            if early:
+    def prepare(self, now: float) -> tuple[dict[int, int], float]:
+        """Send waiting requests. Return the socket with its poll events, and when to call `process`."""
+        self._polled = self._socket
+        if self._received_early:
+            return {}, now
+        self._flush()
+        if self._socket is None:
+            return {}, NEVER
+        return {self._socket.fileno(): select.POLLIN | (select.POLLOUT if self.outgoing() else 0)}, NEVER
+
+    def process(self, ready: Collection[int]) -> None:
+        """Read from the socket, and process the data."""
+        polled, early = self._polled, self._received_early
+        if early:
+            with self.changed:
+                self._received_early = b""
                 self.receive(early, time.monotonic())
-                timeout = 0.0
-            self._flush()
-            connected = self._socket
-            waits = bool(self.outgoing())
-        if connected is None:
-            wait_ready({}, min(timeout, _RECONNECT_PAUSE_S))
+        if polled is None or not ready:
             return
         data, why = b"", "the connection to the server was lost"
         try:
-            watched = {connected.fileno(): select.POLLIN | (select.POLLOUT if waits else 0)}
-            if not wait_ready(watched, timeout, self._interrupt if interruptible else None):
-                return
-            data = connected.recv(_RECEIVE_BYTES)
+            data = polled.recv(_RECEIVE_BYTES)
         except BlockingIOError:
             return  # the socket is writable, but not readable
         except ConnectionResetError:  # the server closed the connection without reading all requests
             pass
-        except (OSError, ValueError) as error:  # ValueError: another thread has closed the socket
+        except OSError as error:
             why = f"the connection to the server was lost: {error}"
         with self.changed:
-            if connected is not self._socket:
+            if polled is not self._socket:
                 return  # another thread has disconnected
             now = time.monotonic()
             if data:
@@ -427,11 +486,18 @@ class ReconnectingConnection(SocketConnection):
     It has no thread of its own, so it reconnects during later calls. Only `close` ends it for good.
     """
 
+    reconnects = True
+
     def __init__(
-        self, socket: str | None = None, *, name: str | None = None, patience_s: float = ANSWER_LIMIT_S
+        self,
+        socket: str | None = None,
+        *,
+        name: str | None = None,
+        patience_s: float = ANSWER_LIMIT_S,
+        attempt: ConnectionAttempt | None = None,
     ) -> None:
         """Connect to a server. The arguments are those of `SocketConnection`."""
-        super().__init__(socket, name=name, patience_s=patience_s)
+        super().__init__(socket, name=name, patience_s=patience_s, attempt=attempt)
         #: monotonic time of the next attempt to connect. During an attempt, the greeting must arrive by this time.
         self._due = 0.0
 
@@ -462,23 +528,24 @@ class ReconnectingConnection(SocketConnection):
         else:
             self._schedule_retry(ServerUnavailable(f"nothing was sent to the server at {self.path}: {why}"), now)
 
-    def _step(self, timeout: float, interruptible: bool) -> None:
-        """Reconnect if necessary, wait up to `timeout` seconds for data, and process it."""
+    def prepare(self, now: float) -> tuple[dict[int, int], float]:
+        """Reconnect if the connection is needed. Return the socket with its poll events, and when to call `process`."""
+        is_needed = bool(self.exchanges or self.listeners)
+        if self._socket is not None and not self.greeted and now >= self._due:
+            self._drop()
+            self._give_up_socket()
+            self._schedule_retry(ServerUnavailable(f"the server at {self.path} doesn't respond"), now)
+        if self.ended is None and is_needed:
+            self._connect_again(now)
+        watched, due = super().prepare(now)
+        return watched, self._due if not self.greeted and (is_needed or self._socket) else due
+
+    def process(self, ready: Collection[int]) -> None:
+        """Read from the socket, and process the data. Close the socket if it is no longer used."""
+        super().process(ready)
         with self.changed:
-            now = time.monotonic()
-            if self._socket is not None and not self.greeted and now >= self._due:
-                self._drop()
-                self._give_up_socket()
-                self._schedule_retry(ServerUnavailable(f"the server at {self.path} doesn't respond"), now)
-            if self.ended is None:
-                self._connect_again(now)
-            if not self.greeted:
-                timeout = max(0.0, min(timeout, self._due - now))
-            polled = self._socket
-        super()._step(timeout, interruptible)
-        with self.changed:
-            if polled is not None and polled is not self._socket:
-                polled.close()
+            if self._polled is not None and self._polled is not self._socket:
+                self._polled.close()
 
     def receive(self, data: bytes, now: float) -> None:
         """Process received bytes. If the greeting refuses this client, disconnect and retry."""

@@ -1,5 +1,6 @@
 """Goal handles, and the merged events of several goals.
 
+`GoalCalls` is the part of a handle that the blocking and the asyncio client share. `GoalHandle` is the blocking handle.
 A handle needs a connection, but no client. The connection delivers the events of all handles while any thread waits for
 one of them. A handle changes only while the connection's lock is held, and never after its goal has ended.
 """
@@ -8,32 +9,27 @@ from __future__ import annotations
 
 import time
 
-from talkcli.client.connection import take_repeatedly
+from talkcli.client.connection import event_reader
 from talkcli.client.core import TrackedGoal
-from talkcli.errors import UsageError
+from talkcli.errors import TalkError, UsageError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Cancel
 from talkcli.goals.states import State
+from talkcli.polling import run_blocking
 from talkcli.protocol.events import Canceled, PausedChanged, Result, WordHeard, goals
 from talkcli.protocol.requests import Status, Wait
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Awaitable, Callable, Iterator, Sequence
 
     from talkcli.client.connection import Connection
-    from talkcli.errors import TalkError
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.events import Event
 
 
-class GoalHandle(TrackedGoal):
-    """A handle for following and cancelling a goal.
-
-    Any number of threads may use it. Events are buffered until they are read. If there are more than 5,000 words and
-    pauses, the oldest are dropped. `events`, `feedback` and `poll` read from the same buffer, so each event is returned
-    only once. A new loop continues where an interrupted one stopped. Each thread needs an iterator of its own.
-    """
+class GoalCalls(TrackedGoal):
+    """The base class of goal handles. It has the calls that never wait, and coroutines for those that wait."""
 
     def __init__(self, connection: Connection, goal: Goal) -> None:
         super().__init__(goal)
@@ -53,56 +49,6 @@ class GoalHandle(TrackedGoal):
         Calls that read from the server update it, for example `wait` and `poll`.
         """
         return self.goal.state
-
-    def wait(self, timeout: float | None = None) -> Goal:
-        """Wait until the goal has ended, and return it. Raise TimeoutError if `timeout` expires first.
-
-        If the goal can no longer be followed, for example because the
-        server was restarted, the goal ends as LOST. It may or may not have been spoken.
-
-        Args:
-            timeout: time limit in seconds; None for no limit.
-
-        Raises:
-            TimeoutError: the goal has not ended in this time. The goal itself is not affected.
-        """
-        end = _end_time(timeout)
-        self._follow(feedback=False)
-        if not self._connection.wait_until(lambda: self.state.terminal, end):
-            self._give_up(timeout)
-        return self.goal
-
-    def events(self, timeout: float | None = None) -> Iterator[Event]:
-        """Iterate over the goal's events as they happen. The last event is the Result.
-
-        There is a StateChanged for each state. If the goal was sent or followed with `feedback`, there is also a
-        WordHeard for each word as it is heard, and a PausedChanged whenever speech is paused or resumed. If the goal
-        can no longer be followed, for example because the server was restarted, the goal ends as LOST.
-
-        Args:
-            timeout: seconds in which the goal must end, counted from this call; None for no limit.
-
-        Raises:
-            TimeoutError: the goal has not ended in this time.
-        """
-        end = _end_time(timeout)
-        self._follow(feedback=False)
-        return self._iterate_events(end, timeout)
-
-    def feedback(self, timeout: float | None = None) -> Iterator[WordHeard]:
-        """Iterate over the goal's words as they are heard, until the goal has ended.
-
-        If the goal was sent without `feedback`, only words that are heard after this call are yielded.
-
-        Args:
-            timeout: seconds in which the goal must end, counted from this call; None for no limit.
-
-        Raises:
-            TimeoutError: the goal has not ended in this time.
-        """
-        end = _end_time(timeout)
-        self._follow(feedback=True)
-        return (each for each in self._iterate_events(end, timeout) if isinstance(each, WordHeard))
 
     def poll(self) -> Event | None:
         """Read from the server without blocking. Return the goal's next event, if any.
@@ -142,23 +88,33 @@ class GoalHandle(TrackedGoal):
             if failures and self._connection.unsent_bytes:
                 raise failures[0]
 
-    def cancel(self) -> Goal:
-        """Cancel the goal, and wait until it has stopped. Return it.
+    # -- internal
 
-        Raises:
-            UnknownGoal: the server doesn't know the goal, for example because the server was restarted.
-            ServerUnavailable: the server can't be reached.
-            Lost: the server didn't answer. The goal may have been cancelled.
-        """
+    async def _wait(self, timeout: float | None) -> Goal:
+        """Wait until the goal has ended, and return it. Raise TimeoutError if `timeout` expires first."""
+        end = end_time(timeout)
+        await self._follow(feedback=False)
+        if not await self._connection.until(lambda: self.state.terminal, end):
+            self._give_up(timeout)
+        return self.goal
+
+    async def _read_event(self, read: Callable[[], Awaitable[Event | None]], timeout: float | None) -> Event:
+        """Return the goal's next event. Raise TimeoutError if the deadline of `read` has passed."""
+        while (event := await read()) is None:
+            self._give_up(timeout)
+        if isinstance(event, Result):
+            self._result_taken = True
+        return event
+
+    async def _cancel(self) -> Goal:
+        """Cancel the goal, and wait until it has stopped. Return it."""
         if not self.state.terminal:
-            found = Canceled.from_items(self._connection.request(Cancel((self.id,)))[1])
+            found = Canceled.from_items((await self._connection.ask(Cancel((self.id,))))[1])
             goal = next((each for each in (*found.canceled, *found.ended) if each.id == self.id), None)
-            goal = goal or Goal.from_json(self._connection.request(Status(self.id))[0].get("goal"))
+            goal = goal or Goal.from_json((await self._connection.ask(Status(self.id)))[0].get("goal"))
             with self._connection.changed:
                 self._update(goal)
         return self.goal
-
-    # -- internal
 
     def _listen(self, *, feedback: bool) -> None:
         """Register this handle to receive the goal's events, optionally with words.
@@ -167,19 +123,7 @@ class GoalHandle(TrackedGoal):
         """
         self._listen_to(self._connection.listeners, feedback=feedback, now=time.monotonic())
 
-    def _iterate_events(self, end: float | None, timeout: float | None) -> Iterator[Event]:
-        """Yield the goal's events up to the Result. Raise TimeoutError if `end` (monotonic) passes first."""
-        for event in take_repeatedly(self._connection, self._take, end):
-            if event is None:
-                self._give_up(timeout)
-            elif isinstance(event, Result):
-                self._result_taken = True
-                yield event
-                return
-            else:
-                yield event
-
-    def _follow(self, *, feedback: bool) -> None:
+    async def _follow(self, *, feedback: bool) -> None:
         """Ask the server for the goal's events, unless it already sends them."""
         if self.state.terminal or (self._followed_at is not None and (self._with_feedback or not feedback)):
             return
@@ -188,7 +132,7 @@ class GoalHandle(TrackedGoal):
             self._update(next(goals(items, "goal")))
             self._listen(feedback=feedback)
 
-        self._connection.request(Wait((self.id,), feedback), accepted)
+        await self._connection.ask(Wait((self.id,), feedback), accepted)
 
     def _give_up(self, timeout: float | None) -> None:
         """End the goal as LOST if the connection has ended. Otherwise, raise TimeoutError."""
@@ -202,6 +146,78 @@ class GoalHandle(TrackedGoal):
             with self._connection.changed:
                 self._mark_lost(f"{ended}; the sentence may still be spoken")
         return ended is not None
+
+
+class GoalHandle(GoalCalls):
+    """A handle for following and cancelling a goal.
+
+    Any number of threads may use it. Events are buffered until they are read. If there are more than 5,000 words and
+    pauses, the oldest are dropped. `events`, `feedback` and `poll` read from the same buffer, so each event is returned
+    only once. A new loop continues where an interrupted one stopped. Each thread needs an iterator of its own.
+    """
+
+    def wait(self, timeout: float | None = None) -> Goal:
+        """Wait until the goal has ended, and return it. Raise TimeoutError if `timeout` expires first.
+
+        If the goal can no longer be followed, for example because the server was restarted, the goal ends as LOST. It
+        may or may not have been spoken.
+
+        Args:
+            timeout: time limit in seconds; None for no limit.
+
+        Raises:
+            TimeoutError: the goal has not ended in this time. The goal itself is not affected.
+        """
+        return run_blocking(self._wait(timeout))
+
+    def events(self, timeout: float | None = None) -> Iterator[Event]:
+        """Iterate over the goal's events as they happen. The last event is the Result.
+
+        There is a StateChanged for each state. If the goal was sent or followed with `feedback`, there is also a
+        WordHeard for each word as it is heard, and a PausedChanged whenever speech is paused or resumed. If the goal
+        can no longer be followed, for example because the server was restarted, the goal ends as LOST.
+
+        Args:
+            timeout: seconds in which the goal must end, counted from this call; None for no limit.
+
+        Raises:
+            TimeoutError: the goal has not ended in this time.
+        """
+        end = end_time(timeout)
+        run_blocking(self._follow(feedback=False))
+        return self._iterate_events(end, timeout)
+
+    def feedback(self, timeout: float | None = None) -> Iterator[WordHeard]:
+        """Iterate over the goal's words as they are heard, until the goal has ended.
+
+        If the goal was sent without `feedback`, only words that are heard after this call are yielded.
+
+        Args:
+            timeout: seconds in which the goal must end, counted from this call; None for no limit.
+
+        Raises:
+            TimeoutError: the goal has not ended in this time.
+        """
+        end = end_time(timeout)
+        run_blocking(self._follow(feedback=True))
+        return (each for each in self._iterate_events(end, timeout) if isinstance(each, WordHeard))
+
+    def cancel(self) -> Goal:
+        """Cancel the goal, and wait until it has stopped. Return it.
+
+        Raises:
+            UnknownGoal: the server doesn't know the goal, for example because the server was restarted.
+            ServerUnavailable: the server can't be reached.
+            Lost: the server didn't answer. The goal may have been cancelled.
+        """
+        return run_blocking(self._cancel())
+
+    def _iterate_events(self, end: float | None, timeout: float | None) -> Iterator[Event]:
+        """Yield the goal's events up to the Result. Raise TimeoutError if `end` (monotonic) passes first."""
+        read, event = event_reader(self._connection, self._take, end), None
+        while not isinstance(event, Result):
+            event = run_blocking(self._read_event(read, timeout))
+            yield event
 
 
 def merged(handles: Sequence[GoalHandle], timeout: float | None = None) -> Iterator[tuple[GoalHandle, Event]]:
@@ -223,13 +239,13 @@ def merged(handles: Sequence[GoalHandle], timeout: float | None = None) -> Itera
     stream = _EventStream(handles)
     if not handles:
         return
-    for found in take_repeatedly(handles[0]._connection, stream.take, _end_time(timeout)):
+    read = event_reader(handles[0]._connection, stream.take, end_time(timeout))
+    while stream.unfinished:
+        found = run_blocking(read())
         if not found:
             for each in stream.unfinished:
                 each._give_up(timeout)
         yield from found
-        if not stream.unfinished:
-            return
 
 
 class _EventStream:
@@ -268,6 +284,6 @@ class _EventStream:
         return merged_events
 
 
-def _end_time(timeout: float | None) -> float | None:
+def end_time(timeout: float | None) -> float | None:
     """Return the monotonic time at which a timeout expires."""
     return None if timeout is None else time.monotonic() + timeout

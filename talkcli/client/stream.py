@@ -1,19 +1,21 @@
 """Texts that are spoken while they are written.
 
-`SpeechStream` sends the text and blocks while the server holds its replies back. `growing` decides what to send.
+`SpeechStream` sends the text and blocks while the server holds its replies back. `StreamCalls` is the part that it
+shares with the stream of the asyncio client. `growing` decides what to send.
 """
 
 from __future__ import annotations
 
 from contextlib import suppress
 
-from talkcli.client.goal import GoalHandle
+from talkcli.client.goal import GoalCalls, GoalHandle
 from talkcli.client.growing import TextSender
 from talkcli.errors import Lost, RequestRefused, ServerUnavailable, TalkError, UnknownGoal
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Append, Say
 from talkcli.goals.states import State
+from talkcli.polling import run_blocking
 
 if TYPE_CHECKING:
     from talkcli.client.connection import Connection
@@ -23,7 +25,112 @@ if TYPE_CHECKING:
 _MAX_RESENDS = 5
 
 
-class SpeechStream:
+class StreamCalls:
+    """The base class of speech streams, with coroutines that send the text."""
+
+    #: the class of the goal's handle
+    _handle_type: type[GoalCalls]
+
+    def __init__(self, connection: Connection, say: Say) -> None:
+        """Create a stream without sending anything.
+
+        `say` has the options of the goal.
+        """
+        #: the handle of the goal, or None until there is text that can be spoken
+        self.goal: GoalCalls | None = None
+        self._connection = connection
+        self._text = TextSender(say)
+        #: the id of the goal, or None if no goal was sent. A goal that was sent may be spoken even if the wait for the
+        #: server's answer was interrupted.
+        self._goal_id: str | None = None
+        #: whether the server takes no more text, because the goal has ended or is being stopped
+        self._refused = False
+
+    @property
+    def _stopped(self) -> bool:
+        """Whether the goal has ended or is being stopped."""
+        return self._refused or (self.goal is not None and self.goal.state.terminal)
+
+    async def _write(self, text: str) -> bool:
+        """Add text at the end. Return whether the goal accepts more."""
+        if not self._stopped:
+            self._text.write(text)
+        return await self._send()
+
+    async def _finish(self, *, failed: bool) -> None:
+        """Complete the text, or stop the goal if the program that writes the text has failed."""
+        if failed and not self._stopped:
+            await self._break_off()
+        elif self.goal and not failed:
+            self._text.ended = True
+            await self._send()
+
+    async def _send(self) -> bool:
+        """Send all text that can be sent, and wait for the answers. Return whether the goal accepts more."""
+        connection, resends = self._connection, 0
+        while not self._stopped and (request := self._text.request_to_send()):
+            if isinstance(request, Say):
+                await self._begin_goal(request)
+                continue
+            try:
+                await connection.ask(request, self._add_text)
+            except RequestRefused as error:
+                if self._process_error(error):
+                    raise
+            except (Lost, ServerUnavailable) as error:
+                # Wait until the client has reconnected, or until it gives up and the goal is LOST.
+                await connection.until(lambda: self._stopped or connection.absent_since is None, None)
+                resends += 1
+                if connection.ended is not None or connection.absent_since is not None or resends > _MAX_RESENDS:
+                    self._process_error(error)
+                    raise Lost(f"{error.message}; the sentence may still be spoken") from error
+        return not self._stopped
+
+    async def _begin_goal(self, request: Say) -> None:
+        """Send the goal with the beginning of its text, and wait for the server's answer."""
+        handle = self._handle_type(self._connection, Goal("", State.PENDING))
+
+        def on_reply(reply: JsonObject, _: list[JsonObject]) -> None:
+            handle._accept(reply)
+            handle._listen(feedback=request.feedback)
+            self._text.accepted(handle.id)
+            self.goal, self._goal_id = handle, handle.id
+
+        self._goal_id = request.id
+        try:
+            await self._connection.ask(request, on_reply)
+        except TalkError:
+            self._goal_id = None
+            raise
+
+    def _add_text(self, *_: object) -> None:
+        """Add the text that the server has accepted to the goal's handle."""
+        assert self.goal
+        addition = self._text.accepted(self.goal.id)
+        assert isinstance(addition, Append)
+        self.goal._grow(addition)
+
+    async def _break_off(self) -> None:
+        """Ask the server to stop the goal, because its text will never be complete."""
+        if self._goal_id:
+            with suppress(TalkError):
+                await self._connection.ask(Append(self._goal_id, broken=True))
+
+    def _process_error(self, error: TalkError) -> bool:
+        """Record that text could not be added. Return whether the goal accepts other text."""
+        assert self.goal
+        if isinstance(error, RequestRefused) and error.code == "goal_ended":
+            self._refused = True
+        elif isinstance(error, RequestRefused) and not isinstance(error, UnknownGoal):
+            self._text.refused()
+            return True
+        else:
+            with self._connection.changed:
+                self.goal._mark_lost(f"{error.message}; the sentence may still be spoken")
+        return False
+
+
+class SpeechStream(StreamCalls):
     """A text that is spoken while it is written.
 
     `Client.stream` creates the stream.
@@ -34,17 +141,8 @@ class SpeechStream:
     Only one thread at a time may write. Any thread may use the goal's handle.
     """
 
-    def __init__(self, connection: Connection, say: Say) -> None:
-        """Create a stream without sending anything.
-
-        `say` has the options of the goal.
-        """
-        #: the handle of the goal, or None until there is text that can be spoken
-        self.goal: GoalHandle | None = None
-        self._connection = connection
-        self._text = TextSender(say)
-        #: whether the server takes no more text, because the goal has ended or is being stopped
-        self._refused = False
+    goal: GoalHandle | None
+    _handle_type = GoalHandle
 
     def write(self, text: str) -> bool:
         """Add text at the end. Return whether the goal accepts more.
@@ -61,9 +159,7 @@ class SpeechStream:
             ServerUnavailable: the server can't be reached. Nothing was sent.
             Lost: the connection broke, and the client could not reconnect. The goal is LOST.
         """
-        if not self._stopped:
-            self._text.write(text)
-        return self._send()
+        return run_blocking(self._write(text))
 
     def wait(self, timeout: float | None = None) -> Goal | None:
         """Wait until the goal has ended, and return it. Return None if there is no goal.
@@ -76,78 +172,4 @@ class SpeechStream:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if self.goal and kind is None:
-            self._text.ended = True
-            self._send()
-        elif self.goal and not self._stopped:
-            self._break_off()
-
-    # -- internal
-
-    @property
-    def _stopped(self) -> bool:
-        """Whether the goal has ended or is being stopped."""
-        return self._refused or (self.goal is not None and self.goal.state.terminal)
-
-    def _send(self) -> bool:
-        """Send all text that can be sent, and wait for the answers. Return whether the goal accepts more."""
-        connection, resends = self._connection, 0
-        while not self._stopped and (request := self._text.request_to_send()):
-            if isinstance(request, Say):
-                self._begin_goal(request)
-                continue
-            try:
-                connection.request(request, self._add_text)
-            except RequestRefused as error:
-                if self._process_error(error):
-                    raise
-            except (Lost, ServerUnavailable) as error:
-                # Wait until the client has reconnected, or until it gives up and the goal is LOST.
-                connection.wait_until(lambda: self._stopped or connection.absent_since is None, None)
-                resends += 1
-                if connection.ended is not None or connection.absent_since is not None or resends > _MAX_RESENDS:
-                    self._process_error(error)
-                    raise Lost(f"{error.message}; the sentence may still be spoken") from error
-        return not self._stopped
-
-    def _begin_goal(self, request: Say) -> GoalHandle:
-        """Send the goal with the beginning of its text. Return its handle.
-
-        Wait for the server's answer.
-        """
-        handle = GoalHandle(self._connection, Goal("", State.PENDING))
-
-        def on_reply(reply: JsonObject, _: list[JsonObject]) -> None:
-            handle._accept(reply)
-            handle._listen(feedback=request.feedback)
-            self._text.accepted(handle.id)
-            self.goal = handle
-
-        self._connection.request(request, on_reply)
-        return handle
-
-    def _add_text(self, *_: object) -> None:
-        """Add the text that the server has accepted to the goal's handle."""
-        assert self.goal
-        addition = self._text.accepted(self.goal.id)
-        assert isinstance(addition, Append)
-        self.goal._grow(addition)
-
-    def _break_off(self) -> None:
-        """Ask the server to stop the goal, because its text will never be complete."""
-        assert self.goal
-        with suppress(TalkError):
-            self._connection.request(Append(self.goal.id, broken=True))
-
-    def _process_error(self, error: TalkError) -> bool:
-        """Record that text could not be added. Return whether the goal accepts other text."""
-        assert self.goal
-        if isinstance(error, RequestRefused) and error.code == "goal_ended":
-            self._refused = True
-        elif isinstance(error, RequestRefused) and not isinstance(error, UnknownGoal):
-            self._text.refused()
-            return True
-        else:
-            with self._connection.changed:
-                self.goal._mark_lost(f"{error.message}; the sentence may still be spoken")
-        return False
+        run_blocking(self._finish(failed=kind is not None))

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING
 from talkcli import paths, peers
 from talkcli.client.connect import connect, hello
 from talkcli.errors import AccessDenied, AddressInUse, ServerUnavailable, TalkError, UsageError
+from talkcli.polling import run_blocking
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -210,7 +211,7 @@ def _path_of(passed: socket.socket) -> str:
 def _refuse_second_server(path: str | None) -> None:
     """Raise AddressInUse if clients can already reach another server."""
     try:
-        found = connect(path, hello(None, urgent=True))
+        found = run_blocking(connect(path, hello(None, urgent=True)))
     except (ServerUnavailable, AccessDenied):
         return  # no server answers clients of this user
     except TalkError as error:

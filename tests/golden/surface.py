@@ -168,7 +168,8 @@ def _members(kind: type) -> Iterator[str]:
     if "__init__" in vars(kind) and not vars(kind).get("__annotations__"):
         yield f"    def __init__{inspect.signature(kind.__init__)}"  # type: ignore[misc]
     yield from (f"    {name}: {kind}" for name, kind in inspect.get_annotations(kind).items())
-    for name, member in sorted(vars(kind).items()):
+    for name in dir(kind):
+        member = inspect.getattr_static(kind, name)
         if name.startswith("_"):
             continue
         if isinstance(member, property):

@@ -12,7 +12,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING
 
-from talkcli.client.client import batches, check, check_id, too_long
+from talkcli.client.calls import batches, check, check_id, too_long
 from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.client.goal import GoalHandle
 from talkcli.errors import EXIT_OK, Lost, ServerUnavailable, TalkError, UnknownGoal, Unreadable, UsageError

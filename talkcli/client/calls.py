@@ -1,0 +1,309 @@
+"""The calls of a client as coroutines, which the blocking and the asyncio client share.
+
+A coroutine waits only with `Connection.ask` and `Connection.until`. The blocking client runs it with `run_blocking`.
+"""
+
+from __future__ import annotations
+
+import time
+
+from talkcli.client.connection import event_reader
+from talkcli.client.core import EventBuffer
+from talkcli.errors import Lost, UnknownGoal, UsageError
+from talkcli.frozen import TYPE_CHECKING, replace
+from talkcli.goals.goal import Goal
+from talkcli.goals.options import MAX_ID_CHARS, MAX_IDS, MAX_LOG_GOALS, Cancel, Say, Set, bad_option, key_error
+from talkcli.goals.states import State
+from talkcli.protocol.events import Canceled, ServerStatus, Snapshot, goal_in, goals
+from talkcli.protocol.lines import MAX_LINE_BYTES, request_line, request_to_json
+from talkcli.protocol.requests import Log, Pause, Resume, Status, Voices, Wait, Watch
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Iterable
+    from typing import Any, Concatenate, ParamSpec, TypeVar
+
+    from talkcli.client.connection import Connection
+    from talkcli.client.core import OnReply
+    from talkcli.client.goal import GoalCalls
+    from talkcli.goals.goal import JsonObject
+    from talkcli.protocol.events import Event
+
+    _Handle = TypeVar("_Handle", bound=GoalCalls)
+    _P = ParamSpec("_P")
+    _R = TypeVar("_R")
+
+#: Number of bytes in a request that are reserved for everything except the list of ids.
+_RESERVED_LINE_BYTES = 4096
+#: The maximum size of an ASCII character, such as an escaped quote, and of any other character in JSON.
+_MAX_ASCII_BYTES, _MAX_CHARACTER_BYTES = 2, 12
+#: A `seq` that has more digits than any real one.
+_LONG_SEQ = 10**15
+
+
+def with_parameters_of(
+    model: Callable[Concatenate[Any, _P], object],  # noqa: ARG001 - for type checkers
+) -> Callable[[Callable[..., _R]], Callable[Concatenate[Any, _P], _R]]:
+    """Return a decorator that tells type checkers that a method has the parameters of `model`."""
+    return lambda method: method
+
+
+class ClientCalls:
+    """The calls of a client. Those that wait are coroutines."""
+
+    _connection: Connection
+    #: the first server's boot id, which is prepended to ids that are only numbers
+    _first_boot: str
+
+    def __init__(self, connection: Connection) -> None:
+        """Use a connection that has received the server's greeting."""
+        self._connection, self._first_boot = connection, connection.boot
+
+    @property
+    def path(self) -> str:
+        """The path of the server's socket."""
+        return self._connection.path
+
+    @property
+    def server_pid(self) -> int | None:
+        """The server's process id."""
+        return self._connection.server.pid
+
+    async def cancel(
+        self,
+        ids: Iterable[str] | None = None,
+        *,
+        current: bool = False,
+        before: str | None = None,
+        key: str | None = None,
+    ) -> Canceled:
+        """Cancel goals, and wait until they have stopped. Return the result."""
+        wanted = None if ids is None else [self._full_id(each) for each in ids]
+        first, *others = [None] if wanted is None else batches(wanted) or [()]
+        last = None if before is None else self._full_id(before)
+        requests = [Cancel(first, current, last, key), *map(Cancel, others)]
+        if key is not None and (fault := key_error(key)):
+            raise UsageError(fault)
+        items: list[JsonObject] = []
+        unknown: list[str] = []
+        for request in requests:
+            try:
+                items += (await self._connection.ask(request))[1]
+            except UnknownGoal as error:
+                items += error.items
+                unknown.append(error.message)
+        if unknown:
+            raise UnknownGoal("\n".join(unknown), items=items)
+        return Canceled.from_items(items)
+
+    async def status(self) -> ServerStatus:
+        """Return the state of the server, with its active, pending and recent goals."""
+        return ServerStatus.from_reply(*await self._connection.ask(Status()))
+
+    async def goal(self, goal_id: str) -> Goal:
+        """Return a goal in its current state. Raise UnknownGoal if the server doesn't know it."""
+        reply, _ = await self._connection.ask(Status(self._full_id(goal_id)))
+        return Goal.from_json(reply.get("goal"))
+
+    async def log(self, count: int = 20) -> list[Goal]:
+        """Return the most recently ended goals, including REJECTED ones, oldest first."""
+        if not 0 < count <= MAX_LOG_GOALS:
+            raise UsageError(f"the count must be 1 to {MAX_LOG_GOALS:,}, got {count}")
+        _, items = await self._connection.ask(Log(count))
+        return list(goals(items, "goal"))
+
+    async def voices(self) -> list[JsonObject]:
+        """Return the voices of the server's engine."""
+        _, items = await self._connection.ask(Voices())
+        return [each["voice"] for each in items if isinstance(each.get("voice"), dict)]  # type: ignore[misc]
+
+    async def settings(self) -> JsonObject:
+        """Return the server's settings, which are the defaults for new goals."""
+        return await self.set()
+
+    async def set(
+        self,
+        rate: int | None = None,
+        volume: float | None = None,
+        voice: str | None = None,
+        pitch: int | None = None,
+        preempt: bool | None = None,
+        ttl: float | None = None,
+    ) -> JsonObject:
+        """Change the server's settings. Return all settings."""
+        request = Set(rate, volume, voice, pitch, preempt, ttl)
+        check(request)
+        reply, _ = await self._connection.ask(request)
+        settings = reply.get("settings")
+        return settings if isinstance(settings, dict) else {}
+
+    async def pause(self) -> Goal | None:
+        """Pause all speech, and wait until it has stopped. Return the paused goal, if any."""
+        return goal_in((await self._connection.ask(Pause()))[0])
+
+    async def resume(self) -> Goal | None:
+        """Resume speech. Return the resumed goal, if any."""
+        return goal_in((await self._connection.ask(Resume()))[0])
+
+    # -- calls that clients adapt, because their results depend on the client
+
+    async def _say(
+        self,
+        handle_type: type[_Handle],
+        text: str,
+        *,
+        id: str | None = None,  # noqa: A002 - the option has this name everywhere
+        feedback: bool = False,
+        follow: bool = True,
+        block: bool = True,
+        **options: Any,
+    ) -> _Handle:
+        """Send a text to be spoken. Return the handle of its goal."""
+        goal_id = id or (None if block else self._connection.new_goal_id())
+        request = Say(text, id=goal_id, feedback=feedback, wait=follow or feedback, **options)
+        handle, accepted = self._create_handle(handle_type, request)
+        if handle.state.terminal:
+            return handle
+        if block:
+            await self._connection.ask(request, accepted)
+        else:
+            handle._set_request(request, time.monotonic())
+            self._connection.submit(request, accepted, handle._fail)
+        return handle
+
+    def _stream_request(
+        self,
+        id: str | None = None,  # noqa: A002 - the option has this name everywhere
+        **options: Any,
+    ) -> Say:
+        """Check the options of a stream. Return the request for its goal, without a text."""
+        say = Say("", id=id, wait=True, more=True, **options)
+        check(say)
+        if error := self._connection.unsupported(say):
+            raise error
+        if id is None and self._connection.reconnects:
+            say = replace(say, id=self._connection.new_goal_id())
+        return say
+
+    async def _follow(self, handle_type: type[_Handle], ids: Iterable[str] | None, *, feedback: bool) -> list[_Handle]:
+        """Subscribe to the events of goals. Return the goals' handles."""
+        wanted = None if ids is None else [self._full_id(each) for each in ids]
+        handles: dict[str, _Handle] = {}
+
+        def accepted(_: JsonObject, items: list[JsonObject]) -> None:
+            for goal in goals(items, "goal"):
+                handles[goal.id] = handle_type(self._connection, goal)
+                handles[goal.id]._listen(feedback=feedback)
+
+        for some in [None] if wanted is None else batches(wanted):
+            await self._connection.ask(Wait(some, feedback), accepted)
+        return list(handles.values()) if wanted is None else [handles[each] for each in wanted]
+
+    async def _watch(self, *, reconnect: bool) -> Callable[[], Coroutine[Any, Any, Event]]:
+        """Watch all goals. Return a coroutine function that returns the next event.
+
+        It raises Lost when the stream of events ends.
+        """
+        buffer = EventBuffer(reconnects=reconnect)
+
+        def accepted(reply: JsonObject, items: list[JsonObject]) -> None:
+            buffer.add(Snapshot(ServerStatus.from_reply(reply, items)))
+            self._connection.listeners.watches.add(buffer)
+
+        await self._connection.ask(Watch(), accepted)
+        read = event_reader(self._connection, lambda: buffer.take() or buffer.closed, None)
+
+        async def next_event() -> Event:
+            event = await read()
+            if event is None or isinstance(event, str):
+                why = f"no more events from the server at {self.path}: {self._connection.ended}"
+                raise Lost(buffer.closed or why)
+            return event
+
+        return next_event
+
+    def _create_handle(self, handle_type: type[_Handle], request: Say) -> tuple[_Handle, OnReply]:
+        """Check a `say` request. Return its goal's handle, and the function to call with the reply.
+
+        If the text is too long for a request, the goal is already REJECTED.
+
+        Raises:
+            UsageError: a value is out of its range.
+        """
+        check(request)
+        handle = handle_type(self._connection, too_long(request) or Goal("", State.PENDING))
+
+        def accepted(reply: JsonObject, _: list[JsonObject]) -> None:
+            handle._accept(reply)
+            if request.wait:
+                handle._listen(feedback=request.feedback)
+
+        return handle, accepted
+
+    def _full_id(self, goal_id: str) -> str:
+        """Check a goal id, and add the boot id if it is missing. Return the full id.
+
+        Raises the same errors as `check_id`.
+        """
+        if goal_id.isascii() and goal_id.isdecimal():
+            goal_id = f"{self._first_boot}-{goal_id}"
+        check_id(goal_id)
+        return goal_id
+
+
+def check_id(goal_id: str) -> None:
+    """Raise an error if no goal can have this id.
+
+    Raises:
+        UsageError: the id is empty.
+        UnknownGoal: the id is too long for any goal.
+    """
+    if not goal_id:
+        raise UsageError("the goal's id is empty; check the variable that should contain it")
+    if len(goal_id) > MAX_ID_CHARS:
+        raise UnknownGoal(f"unknown goal {goal_id[:MAX_ID_CHARS]!a}…: an id has at most {MAX_ID_CHARS} characters")
+
+
+def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
+    """Return the ids without duplicates, in groups that each fit into one request."""
+    groups: list[list[str]] = []
+    room = 0
+    for each in dict.fromkeys(ids):
+        plain = each.isascii() and each.isprintable()
+        size = (_MAX_ASCII_BYTES if plain else _MAX_CHARACTER_BYTES) * len(each) + len('"", ')
+        if not groups or size > room or len(groups[-1]) == MAX_IDS:
+            groups.append([])
+            room = MAX_LINE_BYTES - _RESERVED_LINE_BYTES
+        room -= size
+        groups[-1].append(each)
+    return [tuple(each) for each in groups]
+
+
+def check(request: Say | Set) -> None:
+    """Raise UsageError if an option of a request is invalid."""
+    for option in request.options:
+        try:
+            fault = option.type_error(getattr(request, option.name))
+        except (TypeError, ValueError) as error:  # `data` contains a value that JSON can't represent
+            fault = f"can't be sent as JSON: {error}"
+        if fault:
+            raise UsageError(f"{option.name!r} {fault}")
+    if words := bad_option(request):
+        raise UsageError(words)
+
+
+def too_long(request: Say) -> Goal | None:
+    """Return a REJECTED goal if a text is too long for a request. Otherwise, return None.
+
+    Raises:
+        UsageError: `data` has no JSON form.
+    """
+    try:
+        line = request_line({"seq": _LONG_SEQ, **request_to_json(request)})
+    except ValueError as error:  # `data` contains NaN or an infinite number
+        raise UsageError(f"'data' can't be sent as JSON: {error}") from None
+    if len(line) <= MAX_LINE_BYTES:
+        return None
+    from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
+
+    message = f"not spoken: the text is too long for a request ({len(request.text):,} characters)"
+    return Goal("", State.REJECTED, request.text, reason=Reason.TEXT_TOO_LONG.value, message=message)
