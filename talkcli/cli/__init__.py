@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def main() -> NoReturn:
-    """Run the command line in `sys.argv`. Then exit."""
+    """Run the command line in `sys.argv`, and exit with its exit code."""
     try:
         code = run(sys.argv[1:])
     except KeyboardInterrupt:  # no command has been started yet

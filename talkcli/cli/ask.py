@@ -37,9 +37,9 @@ def cancel(options: CommonOptions, ids: tuple[str, ...], current: bool, before: 
     """Cancel the selected goals, or all goals if none are selected. Print their ids."""
     with options.connect() as client:
         try:
-            done = client.cancel(ids or None, current=current, before=before, key=key)
-            _show_canceled(done, options)
-            if key and not done.canceled and not options.quiet and sys.stderr and sys.stderr.isatty():
+            reply = client.cancel(ids or None, current=current, before=before, key=key)
+            _show_canceled(reply, options)
+            if key and not reply.canceled and not options.quiet and sys.stderr and sys.stderr.isatty():
                 _suggest_similar_key(key, client)
         except UnknownGoal as error:
             _show_canceled(Canceled.from_items(error.items), options)
@@ -143,7 +143,7 @@ def resume(options: CommonOptions) -> None:
 
 
 def _report_pause(options: CommonOptions, goal: Goal | None, *, paused: bool, message: str) -> None:
-    """Report that speech has been paused or resumed."""
+    """Print a message that speech has been paused or resumed, or a JSON object with --json."""
     if options.json:
         show_json({"paused": paused, "goal": None if goal is None else goal.to_json()})
     elif not options.quiet:
@@ -189,14 +189,14 @@ def _create_examination(
     return broker.BrokerExamination(robot, os.environ, insecure=options.insecure, interrupt=interrupt)
 
 
-def _show_canceled(done: Canceled, options: CommonOptions) -> None:
-    """Report which goals were cancelled and which had already ended."""
-    for goal in done.canceled:
+def _show_canceled(reply: Canceled, options: CommonOptions) -> None:
+    """Print the cancelled goals, and report those that had already ended."""
+    for goal in reply.canceled:
         if options.json:
             show_json(goal.to_json())
         elif not options.quiet:
             show(goal.id)
-    for goal in done.ended:
+    for goal in reply.ended:
         if not options.quiet:
             note(f"goal {goal.id} had already ended: {goal.state.name}")
 

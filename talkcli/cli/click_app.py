@@ -149,9 +149,9 @@ class _HelpfulCommand(click.Command):
     exit_codes: ExitCodes | None
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Return the completions with shortened help texts.
+        """Return the completions, each with only the first sentence of its help text.
 
-        Only the first sentence is kept, because a shell has no room for more.
+        A shell has no room for more.
         """
         found = super().shell_complete(ctx, incomplete)
         for each in found:
@@ -278,7 +278,7 @@ class _CommandGroup(_HelpfulCommand, click.Group):
 @click.version_option(__version__, prog_name="talk", message="%(prog)s %(version)s")
 @click.pass_context
 def talk(context: click.Context) -> None:
-    """Print an overview if no command is given."""
+    """Print an overview if `talk` is run without a command."""
     if context.invoked_subcommand is None:
         click.echo(_format_overview(context))
 
@@ -298,7 +298,7 @@ def _format_overview(context: click.Context) -> str:
 
 
 def run(arguments: list[str]) -> int:
-    """Run a command line or print its completions. Return the exit code."""
+    """Run a command line, or print completions for the shell. Return the exit code."""
     options = CommonOptions()
     if "_TALK_COMPLETE" in os.environ:
         from talkcli.cli import completion
@@ -308,10 +308,7 @@ def run(arguments: list[str]) -> int:
 
 
 def _run_group(arguments: list[str], options: CommonOptions) -> object:
-    """Run a command line with click. Return its result, or the exit code after an error.
-
-    Report click's errors.
-    """
+    """Run a command line with click, and report usage errors. Return the exit code, if any."""
     try:
         with talk.make_context("talk", [*arguments], obj=options) as context:
             return talk.invoke(context)

@@ -250,7 +250,7 @@ def _parse_duration(text: str, unit: str) -> float:
 
 
 def _parse_file_mode(text: str) -> int:
-    """Parse the file mode of a socket. Raise ValueError if it isn't suitable.
+    """Parse an octal file mode. Raise ValueError if it is invalid or unsuitable for a socket.
 
     The owner must be able to read and write, and nobody may have execute permission.
     """

@@ -71,7 +71,7 @@ _OTHER_EXTENSIONS = (".aac", ".aiff", ".au", ".flac", ".m4a", ".mp3", ".mp4", ".
 
 
 def _say_fault(values: Mapping[str, Any], typed: frozenset[str]) -> str | None:
-    """Return an error message if options of `say` can't be combined."""
+    """Return an error message if the options of `say` are invalid or can't be combined."""
     output, waits = values["output"], values["wait"] or values["feedback"]
     if output is not None:
         bad = [long_flag(each, values[each.name]) for each in _SAY_OPTIONS if each.name in typed - _SERVERLESS_OPTIONS]
@@ -90,7 +90,7 @@ def _say_fault(values: Mapping[str, Any], typed: frozenset[str]) -> str | None:
 
 
 def _input_fault(values: Mapping[str, Any], typed: frozenset[str]) -> str | None:
-    """Return an error message if TEXT can't be combined with the options that read standard input."""
+    """Return an error message if TEXT is missing or conflicts with options for standard input."""
     text = values["text"]
     if values["stream"] and (values["lines"] or text not in {(), ("-",)}):
         return "--stream speaks standard input as one text; leave out TEXT and --lines"
@@ -165,7 +165,7 @@ _SERVE_OPTIONS = (
 
 
 def _serve_fault(values: Mapping[str, Any], _: frozenset[str]) -> str | None:
-    """Return an error message if options of `serve` can't be combined."""
+    """Return an error message if `file:` has no path, or if the player can't use --device."""
     player = values["player"] or ""
     if values["device"] and player.startswith(("null", "file:")):
         return f"the player {player} has no devices; leave out --device"
@@ -175,7 +175,7 @@ def _serve_fault(values: Mapping[str, Any], _: frozenset[str]) -> str | None:
 
 
 def _bridge_fault(values: Mapping[str, Any], _: frozenset[str]) -> str | None:
-    """Return an error message if `bridge` lacks a required --name."""
+    """Return an error message if `bridge` has neither --name nor --print-acl."""
     if values["name"] is None and not values["print_acl"]:
         return "--name is missing; choose the robot's name on the broker, as in: talk bridge --name anna"
     return None

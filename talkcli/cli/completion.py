@@ -62,7 +62,7 @@ def print_completions(talk: click.Command, options: CommonOptions) -> int:
 
 
 def _completion_lines(talk: click.Command, options: CommonOptions) -> list[str]:
-    """Return the completions of the line in COMP_WORDS, formatted for the script."""
+    """Return the completions for the command line in COMP_WORDS, formatted for the shell."""
     line, shell = os.environ["COMP_WORDS"], os.environ["_TALK_COMPLETE"].removesuffix("_complete")
     words = split_arg_string(line)
     # If the next character would start a new word, the word to complete is empty.
@@ -74,7 +74,7 @@ def _completion_lines(talk: click.Command, options: CommonOptions) -> list[str]:
 
 
 def _format_for_bash(incomplete: str, value: str, _: str | None) -> str:
-    """Format and quote a value for bash.
+    """Format and quote the part of a value that bash inserts.
 
     bash replaces the text in COMP_CWORD, which may be only the last part of the word.
     """
@@ -205,7 +205,7 @@ def unfinished_keys(options: CommonOptions, _: str) -> Offers:
 
 
 def voices(options: CommonOptions, incomplete: str) -> Offers:
-    """Return languages as completions for a voice or, if none match, voice ids or names.
+    """Return languages, voice ids or voice names as completions, whichever match first.
 
     Neural voices are always offered by id, because there are few of them and users select them by id.
     """
@@ -243,7 +243,7 @@ def players(_: CommonOptions, __: str) -> Offers:
 
 
 def _request_status(options: CommonOptions) -> ServerStatus:
-    """Request the server's status, with a time limit of half a second."""
+    """Request and return the server's status, with a time limit of half a second."""
     with options.connect(COMPLETION_TIMEOUT_S) as client:
         return client.status()
 

@@ -92,7 +92,7 @@ class _TerminalFeedback(Feedback):
     """A display that highlights each word on a terminal as it is heard.
 
     The line is rewritten in place and is never wider than the terminal, so only part of a long text is visible. When
-    the goal ends, the whole sentence is written.
+    the goal ends, the whole text is written.
     """
 
     shows_events = True
@@ -112,7 +112,7 @@ class _TerminalFeedback(Feedback):
             self._paint()
 
     def show(self, goal: Goal, event: Event) -> None:
-        """Update the line after an event. When a goal ends, write its whole sentence."""
+        """Update the line after an event. When a goal ends, write its whole text."""
         line = self._line
         if isinstance(event, Result):
             self._show_end(event.goal)
@@ -139,20 +139,20 @@ class _TerminalFeedback(Feedback):
         """Finish the current line, and stop watching the terminal's size."""
         self._resizes.close()
         if self._line:
-            self._write_whole(self._line)
+            self._write_whole_text(self._line)
             self._line = None
 
     def _show_end(self, goal: Goal) -> None:
-        """Write the whole sentence of a goal that has ended."""
+        """Write the final state and the whole text of a goal that has ended."""
         line, ended = self._line, _GoalLine(goal)
         ended.state = goal.state
         if line and line.goal.id == goal.id:
             ended.word = max(line.word, ended.word, key=lambda word: word[1])
             self._line = None
-        self._write_whole(ended)
+        self._write_whole_text(ended)
 
-    def _write_whole(self, line: _GoalLine) -> None:
-        """Write a goal's state and its whole sentence."""
+    def _write_whole_text(self, line: _GoalLine) -> None:
+        """Write a goal's id, its state and its whole text, followed by a line break."""
         ended = line.state is State.SUCCEEDED
         heard, unheard = line.text.split(len(line.text) if ended else line.word[1])
         with self._writing:
@@ -192,7 +192,7 @@ class _ResizeWatcher(threading.Thread):
             self._on_resize()
 
     def close(self) -> None:
-        """Stop the thread, and unblock its signal."""
+        """Stop the thread, and unblock the signal SIGWINCH."""
         if not self._closed:
             self._closed = True
             assert self.ident

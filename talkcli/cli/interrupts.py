@@ -46,7 +46,7 @@ def _poll_output() -> int:
 
 
 class Interrupts:
-    """A context manager that ends a wait on SIGINT, SIGTERM, SIGHUP or closed output.
+    """A context manager that ends a wait on SIGINT, SIGTERM, SIGHUP or, optionally, closed output.
 
     Pass `watched` to `wait_ready` as `interrupt`. The context manager suppresses the Interrupted exception that ends
     the wait, and provides the command's `exit_code`. A second signal ends the process at once. A second SIGHUP is
@@ -101,9 +101,9 @@ class Interrupts:
         return kind is Interrupted
 
     def handle_error(self, error: Interrupted | OSError) -> None:
-        """Discard the output if its reader is gone. Re-raise unexpected errors.
+        """Discard the output if its reader is gone. Re-raise errors other than interrupts or timeouts.
 
-        Interrupts, timeouts and a missing reader are expected. Record in `reader_gone` whether the reader is gone.
+        Record in `reader_gone` whether the reader is gone.
         """
         if isinstance(error, Interrupted | TimeoutError):
             self.reader_gone = STDOUT_FD in self.watched and not has_reader()
@@ -115,7 +115,7 @@ class Interrupts:
             discard_output()
 
     def prepare_cleanup(self) -> None:
-        """Clear the interrupt before a cleanup, which only a new signal can interrupt."""
+        """Clear the interrupt, so that only a new signal can interrupt the cleanup that follows."""
         if self.signal_number is not None:
             signal.set_wakeup_fd(-1)  # a second SIGHUP must not interrupt the cleanup
         self.watched.pop(STDOUT_FD, None)

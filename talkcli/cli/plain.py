@@ -105,7 +105,7 @@ def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, 
 def _build_command(
     command: Command, given: dict[str, Any], words: list[str], environment: Mapping[str, str]
 ) -> PlainCommand | None:
-    """Return the checked command with its defaults, or None if click has to parse the command line."""
+    """Return a checked command with default values added, or None if click has to parse it."""
     common = {name: given.pop(name) for name in _COMMON_NAMES & given.keys()}
     typed = frozenset(given)
     for option in command.options:
@@ -124,10 +124,7 @@ def _build_command(
 
 
 def run(parsed: PlainCommand) -> int:
-    """Run a parsed command. Return its exit code.
-
-    Send the request early if possible.
-    """
+    """Run a parsed command, and send its request early if possible. Return its exit code."""
     started_at = time.monotonic()
     command, given = parsed.command.name, parsed.given
     blocked: set[int] = set()

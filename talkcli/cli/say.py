@@ -98,9 +98,9 @@ def say(
 def _read_input(
     options: CommonOptions, timeout: float | None, wait: bool, feedback: bool, output: str | None
 ) -> str | int:
-    """Return the text on standard input, or an exit code if no text could be read.
+    """Read and return all of standard input, or return an exit code if it is interrupted or too long.
 
-    This is the case if a signal or closed output ends the reading, or if the text is too long, which is reported.
+    Closed output also interrupts the reading. A text that is too long is reported.
     """
     from talkcli.cli.stdin import InputTooLong, read_text, rejected_goal
 
@@ -133,7 +133,7 @@ def _report_sent(goal: GoalHandle, options: CommonOptions, reporter: GoalReporte
 def _write_wav_file(
     path: str, text: str, goal_options: Mapping[str, Any], timeout: float | None, options: CommonOptions
 ) -> int:
-    """Write a text's speech to a file, or to standard output for "-". Return the exit code."""
+    """Write a text's speech to a WAV file, or to standard output for "-". Return the exit code."""
     from talkcli.engine.parent.render import STANDARD_OUTPUT, render
 
     settings, seconds_at_most = _sound_settings(goal_options), seconds_left(options.deadline(timeout))
@@ -156,7 +156,7 @@ def _write_wav_file(
 
 
 def _sound_settings(goal_options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the engine's settings from options and environment variables."""
+    """Return the voice, the rate and other sound settings from options or environment variables."""
     found = {}
     for option in SOUND_OPTIONS:
         value, text = goal_options[option.name], os.environ.get(option.env) if option.env else None

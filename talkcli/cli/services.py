@@ -170,13 +170,13 @@ def _print_unit(
 
 
 def _read_template(name: str) -> str:
-    """Return the text of a template for a unit, with all included files inserted."""
+    """Return the template of a systemd unit, with all included files inserted."""
     with open(os.path.join(os.path.dirname(__file__), "systemd", name), encoding="utf-8") as file:
         return "".join(_read_template(line[1:].strip()) if line.startswith("@") else line for line in file)
 
 
 def _find_program(started_as: str) -> tuple[str, ...]:
-    """Return the command that starts this program."""
+    """Return the words of the command that starts this program."""
     script = os.path.join(os.path.dirname(sys.executable), "talk")
     found = shutil.which(started_as if os.path.basename(started_as) == "talk" else script)
     return (os.path.abspath(found),) if found else (sys.executable, "-m", "talkcli")

@@ -155,7 +155,7 @@ def _cancel_goals(fleet_request: FleetRequest, interrupts: Interrupts, printer: 
 
 
 class _OutcomePrinter:
-    """Prints each robot's outcome as it arrives, and a summary at the end."""
+    """A printer that shows each robot's outcome as it arrives, and a summary at the end."""
 
     def __init__(self, options: CommonOptions, request: Request) -> None:
         self._options, self._request = options, request
@@ -165,7 +165,7 @@ class _OutcomePrinter:
         self._terminal = sys.stderr if shows_count else None
 
     def show_outcomes(self, fleet_request: FleetRequest, timeout: float | None) -> None:
-        """Record and print each outcome as it arrives.
+        """Wait for all outcomes. Record and print each one as it arrives.
 
         This raises the same errors as `FleetRequest.results`.
         """

@@ -263,7 +263,7 @@ def show_json(message: JsonObject) -> None:
 
 
 def show_result(options: CommonOptions, items: Iterable[JsonObject], lines: Callable[[], Iterable[str]]) -> None:
-    """Print `items` as JSON with --json. Otherwise, print the lines from `lines`."""
+    """With --json, print `items` as JSON objects. Otherwise, print the lines that `lines` returns."""
     if options.json:
         for item in items:
             show_json(item)
@@ -315,9 +315,9 @@ def write_error_line(line: str = "") -> None:
 
 
 def terminal_columns(stream: TextIO) -> int:
-    """Return the width of a terminal.
+    """Return the width of a terminal in columns, or a default if it is unknown.
 
-    If the terminal doesn't report it, return COLUMNS or 80.
+    The default is COLUMNS or 80.
     """
     try:
         columns = os.get_terminal_size(stream.fileno()).columns

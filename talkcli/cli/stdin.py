@@ -150,13 +150,13 @@ class LineBuffer:
         return self._lines[0] if self._lines else None
 
     def take(self) -> InputLine:
-        """Remove and return the first line that isn't blank."""
+        """Remove and return the line that `first` has returned."""
         return self._lines.popleft()
 
     def take_expired(self, now: float) -> Iterator[InputLine]:
-        """Remove and yield expired lines.
+        """Remove and yield up to 1,000 expired lines.
 
-        A call yields at most 1,000, so that the caller can check for signals.
+        The limit lets the caller check for signals.
         """
         for _ in range(_MAX_EXPIRED_LINES):
             if not self.first or self.first.expires_at > now:
@@ -230,7 +230,7 @@ class InputSpeaker:
         return interrupts.exit_code
 
     def _run_connected(self) -> int:
-        """Send the input and follow the goals until done.
+        """Send the input over the open connection, and follow its goals.
 
         Return the exit code.
         """
@@ -271,7 +271,7 @@ class InputSpeaker:
 
 
 class LineSpeaker(InputSpeaker):
-    """Speaks each line of standard input as a goal, for `say --lines`."""
+    """The implementation of `say --lines`, which speaks each line of standard input as a goal."""
 
     def __init__(self, *given: Any, ahead: int | None) -> None:
         """Initialise the speaker without connecting to the server.
@@ -298,10 +298,7 @@ class LineSpeaker(InputSpeaker):
         self._failure: tuple[int, int] | None = None
 
     def _run_connected(self) -> int:
-        """Send all lines and follow their goals until done or interrupted.
-
-        Report errors, and return the exit code.
-        """
+        """Send all lines, and follow their goals. Report errors, and return the exit code."""
         try:
             while not self._done:
                 try:
@@ -330,7 +327,7 @@ class LineSpeaker(InputSpeaker):
 
     @property
     def _done(self) -> bool:
-        """Whether all lines have been sent and no goals are left."""
+        """Whether nothing is left to send or, with --wait, to follow."""
         if self._wait and self._goals:
             return False
         return self._error is not None or not (self._unanswered or self._has_lines)
@@ -361,7 +358,7 @@ class LineSpeaker(InputSpeaker):
         return not (self._buffer.first or self._unanswered or self._full)
 
     def _step(self) -> None:
-        """Send as many lines as possible, and process the next input or message.
+        """Send as many lines as possible. Then wait for input or a message, and process it.
 
         Raises:
             TimeoutError: the time limit of the command is over.
@@ -410,7 +407,7 @@ class LineSpeaker(InputSpeaker):
         self._unanswered = handle, self._connection.begin(request, accepted)
 
     def _process_answer(self) -> None:
-        """Process the server's answer to the last line. Do nothing if it hasn't arrived.
+        """Report whether the server has accepted the last sent line, if it has answered.
 
         Follow an accepted goal.
         """
@@ -448,7 +445,7 @@ class LineSpeaker(InputSpeaker):
             self._record_failure(line.number, code)
 
     def _record_failure(self, line_number: int, exit_code: int) -> None:
-        """Record a line's exit code. Later failures don't replace the first one."""
+        """Record a failed line's exit code, unless an earlier line has already failed."""
         if exit_code and (self._failure is None or line_number < self._failure[0]):
             self._failure = line_number, exit_code
 
@@ -484,7 +481,7 @@ class LineSpeaker(InputSpeaker):
                 wait(time.monotonic(), interruptible=False)
 
     def _report_and_forget_goals(self) -> None:
-        """Forget goals that have ended. With --wait, report their events first.
+        """With --wait, report the goals' events and how they ended. Forget goals that have ended.
 
         Events are reported in the order of the lines.
         """

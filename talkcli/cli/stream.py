@@ -29,7 +29,7 @@ _MAX_HELD_LINE_BREAKS = 100
 
 
 class InputDecoder:
-    """Decodes standard input as it arrives. The result is the same text as for `talk say -`."""
+    """An incremental decoder for standard input. Its result is the same text as for `talk say -`."""
 
     def __init__(self) -> None:
         self._decoder = codecs.getincrementaldecoder("utf-8")("surrogateescape")
@@ -58,7 +58,7 @@ class InputDecoder:
 
 
 class StreamSpeaker(InputSpeaker):
-    """Speaks standard input as one goal with a growing text."""
+    """The implementation of `say --stream`, which speaks standard input as one growing text."""
 
     def _run_connected(self) -> int:
         """Wait for the first text. Then send the goal and the rest of the input.
@@ -123,7 +123,10 @@ class StreamSpeaker(InputSpeaker):
         self._text.ended = not data
 
     def _process_answer(self, exchange: Exchange) -> None:
-        """Process the answer to a request to add text. If only this text was refused, stop the goal."""
+        """Read the answer to added text. If the text was refused, report why and stop the goal.
+
+        If the goal has already ended or the connection is lost, only record this.
+        """
         try:
             self._connection.answer(exchange)
         except TalkError as error:

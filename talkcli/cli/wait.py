@@ -44,7 +44,7 @@ def timeout_error(timeout: float | None, details: str = "") -> TimedOut:
 
 
 class GoalReporter:
-    """Prints the ids, events and results of a command's goals."""
+    """A reporter that prints the ids and events of a command's goals, and why they failed."""
 
     def __init__(self, options: CommonOptions, *, feedback: bool) -> None:
         """Initialise the reporter. If `feedback` is true, it shows each event."""
@@ -111,7 +111,7 @@ class GoalReporter:
         return goal.exit_code or EXIT_OK
 
     def cancel(self, goal: GoalHandle, interrupts: Interrupts) -> None:
-        """Cancel a goal, wait briefly for its end, and report the result.
+        """Cancel a goal, wait briefly for its end, and report how it ended.
 
         Output may fail, because Ctrl-C may also have ended the program that reads it, and SIGHUP means that the
         terminal is gone.
@@ -132,10 +132,9 @@ class GoalReporter:
         retry_without_output(self.report, goal.goal, "", True)
 
     def wait_for(self, goal: GoalHandle, interrupts: Interrupts, timeout: float | None, follow: Follow) -> int:
-        """Wait until a goal has ended, or cancel it on an interrupt. Return the exit code.
+        """Wait until a goal has ended. Cancel it on an interrupt or a timeout. Return the exit code.
 
-        A timeout also cancels it. If an earlier command has already sent a goal with the same id, that goal
-        isn't cancelled.
+        If an earlier command has already sent a goal with the same id, that goal isn't cancelled.
 
         Args:
             goal: the goal.
