@@ -135,7 +135,7 @@ class MarkdownReader:
         return "".join(found)
 
     def _read_token(self) -> str | None:
-        """Return the text before the next token. At a token, return the token without its marks.
+        """Return the text before the next token, or the token itself with blanks in place of its marks.
 
         Return None if more text is needed.
         """
@@ -159,7 +159,7 @@ class MarkdownReader:
         return self._read_mark(kind, token)
 
     def _begin_line(self, newline: str) -> str | None:
-        """Begin a line. Return what replaces the newline and the marks that follow it."""
+        """Begin a line. Return the replacement for the newline and the marks that follow it."""
         text, at, before = self._text, self._at + len(newline), self._kind
         if not self._ended and (at == len(text) or _PARTIAL_LINE.match(text, at)):
             return None
@@ -201,7 +201,7 @@ class MarkdownReader:
         return " " * (len(line) + (end >= 0))
 
     def _read_span(self, kind: str, token: re.Match[str]) -> str | None:
-        """Return the replacement for the start of a span. Store where the span ends.
+        """Return the replacement for the opening mark of a span. Store the position of its closing mark.
 
         If the span is code, return the whole span.
         """
@@ -227,10 +227,7 @@ class MarkdownReader:
         return " " * len(mark)
 
     def _read_mark(self, kind: str, token: re.Match[str]) -> str:
-        """Replace the marks of any other token with blanks. Return the result.
-
-        Such a token begins neither a line nor a span.
-        """
+        """Return a token that begins neither a line nor a span, with blanks in place of its marks."""
         text, (start, end), mark = self._text, token.span(), token.group()
         before, after = text[start - 1 : start] or "\n", text[end : end + 1] or "\n"
         kept = 0  # number of characters at the end of the token that aren't marks

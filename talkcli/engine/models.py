@@ -132,7 +132,7 @@ def read_description(path: str) -> VoiceDescription:
 
 
 def open_checked(path: str, advice_if_missing: str = "restore it", model_path: str = "") -> Any:
-    """Open a voice's file. Raise VoiceFileError if another user could change it.
+    """Open a voice's file. Raise VoiceFileError if another user could change it or its model.
 
     Args:
         path: The path of the file.

@@ -359,7 +359,7 @@ def test_a_process_that_dies_idle_is_replaced_sooner_if_it_has_spoken(spoken: bo
         engine._handle_event(process, SPOKEN)
     engine._handle_event(process, protocol.Alive(""))  # as if the process were loading a voice
     before = time.monotonic()
-    engine._lose_process("it is killed", Reason.ENGINE_CRASHED)
+    engine._kill_process("it is killed", Reason.ENGINE_CRASHED)
     assert (engine._restarts.next_start_at - before < RESTART_DELAYS_S[1]) == spoken
     engine._release_process(process)
     engine._actions.close()
@@ -373,7 +373,7 @@ def test_a_goal_ends_once_when_its_process_is_gone_or_overdue(monkeypatch: pytes
     engine = _make_supervisor(process, posted)
     monkeypatch.setattr(engine, "_start_process", lambda: None)
     engine._goal = SupervisedGoal(YES, sent=True, started=True)
-    engine._lose_process("it hangs", Reason.ENGINE_HUNG)
+    engine._kill_process("it hangs", Reason.ENGINE_HUNG)
     due = engine._dying[process]
     engine._handle_deadlines(due - KILL_LIMIT_S / 2)
     assert [type(report).__name__ for report in posted] == ["EngineDied"]
@@ -449,7 +449,7 @@ def _run_process(script: str) -> tuple[list[str], str]:
         process = EngineProcess(CONFIGURE, lines.append)
     while process.stderr in wait_ready({process.stderr: select.POLLIN}, 20.0) and process.read_stderr():
         pass
-    exit_message = process.describe_exit()
+    exit_message = process.reap()
     process.close()
     return lines, exit_message
 

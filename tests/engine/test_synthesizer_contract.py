@@ -75,7 +75,7 @@ class Scripted:
     def voices(self) -> tuple[Voice, ...]:
         return (Voice("one", "en", "One"), Voice("two", None, "Two"))
 
-    def load(self, voice: str) -> None:
+    def choose_voice(self, voice: str) -> None:
         if voice not in {known.id for known in self.voices()}:
             raise UnknownVoice("unknown voice")
         self.voice = voice
@@ -106,7 +106,7 @@ def _piper(voice: str = "piper/tiny") -> Synthesizer:
     """Return a synthesizer with this neural voice. "tiny" hums, and takes only some milliseconds."""
     needs_packages(*NEURAL_PACKAGES)
     synthesizer = Piper(_espeak())
-    synthesizer.load(voice)
+    synthesizer.choose_voice(voice)
     return synthesizer
 
 
@@ -166,7 +166,7 @@ def pitched(request: pytest.FixtureRequest) -> bool:
 def synthesizer(shared_synthesizer: tuple[Synthesizer, str]) -> Iterator[Synthesizer]:
     synthesizer, default_voice = shared_synthesizer
     yield synthesizer
-    synthesizer.load(default_voice)
+    synthesizer.choose_voice(default_voice)
 
 
 class Tape:
@@ -198,14 +198,14 @@ class Tape:
         assert fallback_reason is None, "another voice speaks"
         self.rate = rate
 
-    def word(self, start: int, length: int, position: float) -> None:
+    def word(self, start: int, length: int, audio_start: float) -> None:
         self._called("word")
         assert self.rate, "word was called before begin"
         assert length > 0
-        assert position >= 0
-        assert round(position * self.rate) >= len(self.samples) // SAMPLE_BYTES, "a word came after its samples"
-        assert not self.words or position >= self.words[-1][2], "the position decreased"
-        self.words.append((start, length, position))
+        assert audio_start >= 0
+        assert round(audio_start * self.rate) >= len(self.samples) // SAMPLE_BYTES, "a word came after its samples"
+        assert not self.words or audio_start >= self.words[-1][2], "the position decreased"
+        self.words.append((start, length, audio_start))
 
     def write(self, samples: bytes) -> None:
         self._called("write")
@@ -270,19 +270,19 @@ def test_a_voice_is_loaded_quickly_with_or_without_a_variant(synthesizer: Synthe
     step = len(plain) // 10 + 1
     for voice in [*plain[::step], *(plain[0] + variant for variant in variants[::20])]:
         started_at = time.monotonic()
-        synthesizer.load(voice)
+        synthesizer.choose_voice(voice)
         assert_within(time.monotonic() - started_at, LOADED, voice)
         assert synthesizer.voice == voice
         _spoken(synthesizer, "a")
 
 
-def test_the_last_loaded_voice_speaks(shared_synthesizer: tuple[Synthesizer, str], synthesizer: Synthesizer) -> None:
+def test_the_last_chosen_voice_speaks(shared_synthesizer: tuple[Synthesizer, str], synthesizer: Synthesizer) -> None:
     before = _spoken(synthesizer)
     other = next(voice for voice in reversed(_plain_ids(synthesizer)) if voice != shared_synthesizer[1])
-    synthesizer.load(other)
+    synthesizer.choose_voice(other)
     after = _spoken(synthesizer)
     assert after.samples != before.samples
-    synthesizer.load(shared_synthesizer[1])
+    synthesizer.choose_voice(shared_synthesizer[1])
     _assert_alike(_spoken(synthesizer), before)
 
 
@@ -290,7 +290,7 @@ def test_the_last_loaded_voice_speaks(shared_synthesizer: tuple[Synthesizer, str
 def test_an_unknown_voice_leaves_the_current_one_unchanged(synthesizer: Synthesizer, voice: str) -> None:
     before, spoken = synthesizer.voice, _spoken(synthesizer, sound=SpeechSettings(rate=300))
     with pytest.raises(UnknownVoice) as caught:
-        synthesizer.load(voice)
+        synthesizer.choose_voice(voice)
     assert str(caught.value)
     assert synthesizer.voice == before
     _assert_alike(_spoken(synthesizer, sound=SpeechSettings(rate=300)), spoken)
@@ -345,13 +345,13 @@ def test_phonemes_of_another_language_do_not_change_espeaks_voice() -> None:
     espeak = _espeak()
     default_voice = espeak.voice
     try:
-        espeak.load("gmw/de")
+        espeak.choose_voice("gmw/de")
         before = _spoken(espeak, "zwanzig Züge", SpeechSettings(rate=300))
         with espeak.phonemizer("en-us") as phonemizer:
             assert phonemizer.word_positions("twenty trains") == [(0, 6), (7, 6)]
         _assert_alike(_spoken(espeak, "zwanzig Züge", SpeechSettings(rate=300)), before)
     finally:
-        espeak.load(default_voice)
+        espeak.choose_voice(default_voice)
 
 
 def test_closing_a_phonemizer_does_not_wait_but_the_next_sentence_does() -> None:

@@ -314,14 +314,14 @@ class Driver:
         return self._synthesizer.voice if name == "voice" else fields(self._sound)[name]
 
     def setProperty(self, name: str, value: Any) -> None:  # noqa: N802 - pyttsx3's name
-        """Load a voice, or change a setting for the next sentences.
+        """Choose a voice, or change a setting for the next sentences.
 
         Raises:
             KeyError: the property is unknown.
             UnknownVoice: the voice can't be loaded.
         """
         if name == "voice":
-            self._synthesizer.load(str(value))
+            self._synthesizer.choose_voice(str(value))
         else:
             kind = type(fields(self._sound)[name])
             self._sound = replace(self._sound, **{name: kind(value)})

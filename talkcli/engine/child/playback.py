@@ -315,16 +315,16 @@ class Playback:
             except CannotSpeak:
                 self._untried = self._first_error = None
 
-    def word(self, start: int, length: int, position: float) -> None:
+    def word(self, start: int, length: int, audio_start: float) -> None:
         """Schedule a word to be reported when it is heard.
 
         Args:
             start: offset of the word in the current part of the text.
             length: number of characters.
-            position: start of the word in the audio of this part, in seconds.
+            audio_start: start of the word in the audio of this part, in seconds.
         """
         self._samples.audible = True
-        self._clock.add(TimedWord(self._part_start + start, length, self._seconds(self._part_begin) + position))
+        self._clock.add(TimedWord(self._part_start + start, length, self._seconds(self._part_begin) + audio_start))
 
     def write(self, samples: bytes) -> None:
         """Send samples to the player, except silence at the end. Wait until it has accepted them.

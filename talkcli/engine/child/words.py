@@ -68,7 +68,7 @@ class WordFinder:
         return start, self._end, self._count
 
     def _whole_end(self, start: int, end: int) -> int:
-        """Return where a word ends, given the part that the synthesizer reported."""
+        """Return the end of a word, given the part of it that the synthesizer reported."""
         text = self.text
         if end == len(text) or text[end].isspace():
             return start + len(text[start:end].rstrip(_END_MARKS) or text[start:end])
@@ -114,7 +114,7 @@ class WordClock:
         self._waiting = deque(replace(each, position=max(position, each.position)) for each in self._waiting)
 
     def reset(self, position: float) -> None:
-        """Stop the clock, and prepare it for a stream that begins at this position."""
+        """Stop the clock, and prepare it for a stream that begins at this position in the audio."""
         self._begin = position
         self._started_at = None
         self._silences.clear()
@@ -145,7 +145,7 @@ class WordClock:
             self._started_at = now - elapsed
 
     def elapsed(self, now: float) -> float:
-        """Return the number of seconds heard, including silence."""
+        """Return how many seconds of the stream have been heard, including silence."""
         return 0.0 if self._started_at is None else now - self._started_at
 
     def heard_position(self, now: float) -> float:
@@ -158,7 +158,7 @@ class WordClock:
         return position
 
     def next_word_at(self) -> float:
-        """Return the start time of the next word, or infinity if there is none."""
+        """Return the start time of the next word, or infinity if there is none or the clock is stopped."""
         if self._started_at is None or not self._waiting:
             return float("inf")
         position = self._waiting[0].position

@@ -118,9 +118,9 @@ class EngineProcess:
         return select.POLLIN | (select.POLLOUT if self._unsent else 0)
 
     def receive(self) -> Iterator[protocol.Event | None]:
-        """Send waiting commands. Yield the events that have arrived, without blocking.
+        """Send waiting commands. Yield the events that have arrived, and None if the connection has ended.
 
-        The last one is None if the connection has ended. A malformed message counts as the end of the connection.
+        This never blocks. A malformed message counts as the end of the connection.
         """
         self._flush()
         try:
@@ -141,7 +141,7 @@ class EngineProcess:
             yield event
 
     def read_stderr(self) -> bool:
-        """Read new lines from the process's standard error. Return whether it is still open."""
+        """Pass new lines of standard error to `on_stderr_line`. Return whether it is still open."""
         try:
             data = os.read(self.stderr, 65536)
         except BlockingIOError:
@@ -170,8 +170,8 @@ class EngineProcess:
             kill(pid for pid in process_ids() if peers.process_stat(pid)[3:4] == [b"%d" % self.pid])
             kill_holders(self.liveness)
 
-    def describe_exit(self) -> str:
-        """Kill the process if it is still running. Return a description of how it exited."""
+    def reap(self) -> str:
+        """Wait briefly for the process to exit, or kill it. Return a description of how it exited."""
         wait_ready({self.liveness: select.POLLIN}, _EXIT_WAIT_S)  # macOS doesn't report a closed end without POLLIN
         self.kill()  # must happen before the process is reaped, because its group ID may be reused afterwards
         try:
@@ -281,7 +281,7 @@ class PrivateEngine(contextlib.AbstractContextManager["PrivateEngine"]):
             for event in process.receive() if process.socket.fileno() in ready else ():
                 self._last_event_at = time.monotonic()
                 if event is None:
-                    raise EngineFailed(Reason.ENGINE_CRASHED, process.describe_exit())
+                    raise EngineFailed(Reason.ENGINE_CRASHED, process.reap())
                 if isinstance(event, protocol.StartFailed):
                     raise EngineFailed(event.reason, event.message)
                 yield event

@@ -120,7 +120,7 @@ def render(
         configure = protocol.Configure(os.getpid(), driver, player, None, None, list_voices=False, output_fd=output_fd)
         try:
             with PrivateEngine(configure, deadline=deadline, interrupt=interrupt) as engine:
-                return _speak_all(engine, commands, engine_path, _display_name(path))
+                return _render_all(engine, commands, engine_path, _display_name(path))
         except EngineFailed as error:
             raise _convert_engine_error(error, None) from error
         except TimeoutError:
@@ -144,7 +144,7 @@ def split_into_pieces(text: str) -> Iterator[str]:
     yield text[start:]
 
 
-def _speak_all(engine: PrivateEngine, commands: Iterator[protocol.Speak], engine_path: str, shown_path: str) -> float:
+def _render_all(engine: PrivateEngine, commands: Iterator[protocol.Speak], engine_path: str, shown_path: str) -> float:
     """Render all pieces of the text. Return the length of the audio in seconds.
 
     Args:
@@ -218,7 +218,7 @@ def _is_stream(path: str) -> bool:
 
 @contextlib.contextmanager
 def _open_output(path: str, deadline: float, interrupt: Mapping[int, int] | None) -> Iterator[int]:
-    """Open standard output, a pipe or a device for a `with` block. Refuse terminals."""
+    """Provide a descriptor of standard output, a pipe or a device in a `with` block. Refuse terminals."""
     output_fd = os.dup(1) if path in STANDARD_OUTPUT else _open_pipe_or_device(path, deadline, interrupt)
     try:
         if os.isatty(output_fd):
@@ -250,7 +250,7 @@ def _open_pipe_or_device(path: str, deadline: float, interrupt: Mapping[int, int
 
 @contextlib.contextmanager
 def _hidden_file(path: str) -> Iterator[str]:
-    """Create a hidden file. After the `with` block, it replaces the file at `path`.
+    """Create a hidden file, and provide its path. After the `with` block, the file replaces `path`.
 
     After an error, remove it.
     """

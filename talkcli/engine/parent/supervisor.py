@@ -41,19 +41,16 @@ ENGINE_WAIT_LIMIT_S = 10.0
 
 @frozen
 class EngineDied:
-    """The engine process exited or was killed. The message is for the log."""
+    """A report that the engine process exited, was killed or could not be started."""
 
-    message: str
+    message: str  # for the log
 
 
 @frozen
 class EngineMissing:
-    """No engine process could be started for a long time, so the next goal fails.
+    """A report that no engine process could be started for a long time, so the next goal fails."""
 
-    It fails with this message.
-    """
-
-    message: str
+    message: str  # for the goal
 
 
 @frozen
@@ -68,7 +65,7 @@ class EngineSaid:
 
 @frozen
 class ThreadDied:
-    """The engine thread has crashed. No more goals can be spoken."""
+    """A report that the engine thread has crashed. No more goals can be spoken."""
 
     message: str
 
@@ -140,9 +137,9 @@ class RestartPolicy:
             self._back_off(now)
 
     def start_failed(self, now: float, started_at: float, permanent_error: str | None) -> bool:
-        """Schedule the next start after a failed start. Return whether waiting goals must fail.
+        """Schedule the next start after a failed start. Return whether goals have waited too long.
 
-        They must fail if they have waited too long for an engine.
+        After a permanent error, the result is False, because goals no longer wait.
 
         Args:
             now: the current time.
@@ -303,7 +300,7 @@ class Supervisor:
             self._shut_down()
 
     def _wait_and_handle(self, until: float) -> None:
-        """Wait for messages and actions until a deadline, and handle them."""
+        """Wait until messages or actions arrive or a deadline passes, and process them."""
         watched = dict.fromkeys([self._actions.fileno(), *self._watched], select.POLLIN)
         if self._process:
             watched[self._process.socket.fileno()] = self._process.socket_events
@@ -335,7 +332,7 @@ class Supervisor:
         """Kill processes that have missed a deadline, and start a new process if one is due."""
         missed = next((message for deadline, message in self._deadlines() if now >= deadline), None)
         if missed:
-            self._lose_process(missed, Reason.ENGINE_HUNG)
+            self._kill_process(missed, Reason.ENGINE_HUNG)
         elif self._process is None and now >= self._restarts.next_start_at:
             self._start_process()
         for process in [process for process, deadline in self._dying.items() if now >= deadline]:
@@ -366,10 +363,7 @@ class Supervisor:
         return self._goal if self._goal and self._goal.command.id == goal_id else None
 
     def _begin_goal(self, command: protocol.GoalCommand) -> None:
-        """Make this the current goal, and send it to the process.
-
-        If no process can start, the goal fails.
-        """
+        """Make a goal the current one. Send it to the process, or fail it if no process can start."""
         self._goal = SupervisedGoal(command)
         if self._restarts.permanent_error is not None:
             self._fail_goal(self._goal, Reason.ENGINE_FAILED, self._restarts.permanent_error)
@@ -438,15 +432,15 @@ class Supervisor:
             self._send(protocol.Stop(goal_id))
 
     def _give_up_goal(self, goal_id: str) -> None:
-        """Forget the goal, and replace the process that is speaking it."""
+        """Forget the goal without posting its `Ended`, and replace the process that is speaking it."""
         goal = self._current_goal(goal_id)
         if goal:
             self._goal = None
             if goal.sent:
-                self._lose_process("the engine could not be silenced", Reason.NOT_SILENT)
+                self._kill_process("the engine could not be silenced", Reason.NOT_SILENT)
 
     def _fail_goal(self, goal: SupervisedGoal, reason: Reason, message: str) -> None:
-        """End the goal as failed."""
+        """Forget the current goal, and post an `Ended` event with its failure."""
         self._end_goal(protocol.Ended(goal.command.id, protocol.OUTCOME_FAILED, reason, message))
 
     def _end_goal(self, ended: protocol.Ended) -> None:
@@ -489,10 +483,10 @@ class Supervisor:
 
     def _handle_crash(self, process: EngineProcess) -> None:
         """Retry or end the goal of a crashed process, and post how the process exited."""
-        self._lose_process(f"the engine crashed: {process.describe_exit()}", Reason.ENGINE_CRASHED)
+        self._kill_process(f"the engine crashed: {process.reap()}", Reason.ENGINE_CRASHED)
 
     def _handle_event(self, process: EngineProcess, event: protocol.Event) -> None:
-        """Update the state after an event from the process, and pass the event on."""
+        """Update the goal that an event is about. Post any other event, and send the waiting goal."""
         self._last_sign_at = time.monotonic()
         if isinstance(event, protocol.GoalEvent):
             goal = self._current_goal(event.id)
@@ -506,11 +500,11 @@ class Supervisor:
             self._loading = None
         self._post(event)
         if isinstance(event, protocol.StartFailed):
-            self._lose_process(event.message, event.reason, event)
+            self._kill_process(event.message, event.reason, event)
         self._send_waiting_goal()
 
     def _handle_goal_event(self, goal: SupervisedGoal, event: protocol.GoalEvent) -> None:
-        """Update the goal after an event. Post the event if others need it."""
+        """Update the goal after an event. Post the event if the server needs it."""
         if isinstance(event, protocol.Started):
             goal.started = True
         elif isinstance(event, protocol.Ended):
@@ -521,7 +515,7 @@ class Supervisor:
             goal.hold_due = NEVER
             self._post(event)
 
-    def _lose_process(self, message: str, reason: Reason, failure: protocol.StartFailed | None = None) -> None:
+    def _kill_process(self, message: str, reason: Reason, failure: protocol.StartFailed | None = None) -> None:
         """Kill the process. Retry or end its goal, and schedule the next start.
 
         Args:
@@ -589,7 +583,7 @@ class Supervisor:
 
     def _shut_down(self) -> None:
         """Kill the process, wait briefly for it to exit, and close all descriptors."""
-        self._lose_process("the server is shutting down", Reason.SHUTDOWN)
+        self._kill_process("the server is shutting down", Reason.SHUTDOWN)
         deadline = time.monotonic() + KILL_LIMIT_S / 4
         while self._dying and time.monotonic() < deadline:
             self._wait_and_handle(deadline)

@@ -46,7 +46,7 @@ class SampleSink(Protocol):
     """
 
     def begin(self, rate: int, voice: str, fallback_reason: str | None = None) -> None:
-        """Set the sample rate and the voice.
+        """Announce the sample rate and the voice that speaks.
 
         This must be called first. It may be called again with other values until the first word or sample.
 
@@ -56,17 +56,17 @@ class SampleSink(Protocol):
             fallback_reason: A message saying why the requested voice is not used, or None if it is used.
         """
 
-    def word(self, start: int, length: int, position: float) -> None:
+    def word(self, start: int, length: int, audio_start: float) -> None:
         """Announce the time at which a word will be heard.
 
         Args:
             start: The position of the word in the text.
             length: The length of the word in characters, at least 1.
-            position: The time at which the word begins, in seconds from the first sample.
+            audio_start: The time at which the word begins, in seconds from the first sample.
         """
 
     def write(self, samples: bytes) -> None:
-        """Play these samples. A call with `b""` only checks whether the sentence has to end."""
+        """Play these samples. A call with `b""` only raises Stopped if the sentence has to end."""
 
     def wait(self, descriptor: int) -> None:
         """Keep playing until a file descriptor becomes readable.
@@ -77,7 +77,7 @@ class SampleSink(Protocol):
 
 
 class Synthesizer(Protocol):
-    """Turns text into sound, using the voice that was loaded last.
+    """Turns text into sound, using the voice that was chosen last.
 
     All calls come from the thread that created the synthesizer, and the synthesizer calls its sink only in this thread.
     The constructor raises NotInstalled if software is missing.
@@ -85,7 +85,7 @@ class Synthesizer(Protocol):
 
     #: the name and version shown to users, such as "eSpeak NG 1.51 (system)", or None if unknown
     version: str | None
-    #: the id of the current voice, which is the default voice until another one is loaded
+    #: the id of the current voice, which is the default voice until another one is chosen
     voice: str
 
     def voices(self) -> tuple[Voice, ...]:
@@ -95,7 +95,7 @@ class Synthesizer(Protocol):
         result of a later call may contain more voices.
         """
 
-    def load(self, voice: str) -> None:
+    def choose_voice(self, voice: str) -> None:
         """Choose the voice for the next sentences.
 
         This must return quickly, because it can't be interrupted. If a voice takes seconds to load, `speak` waits for
@@ -109,7 +109,7 @@ class Synthesizer(Protocol):
         """
 
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
-        """Synthesize a sentence, and write it to the sink.
+        """Synthesize a sentence, and pass its samples and words to the sink.
 
         Return after writing all of it. The sample rate comes first, and every word is reported before its first sample
         is written. The times of words never decrease, but their positions in the text may jump back and repeat.

@@ -40,10 +40,10 @@ class CombinedSynthesizer:
         """Return all voices of libespeak-ng, and then all installed neural voices."""
         return (*self._espeak.voices(), *models.installed_voices())
 
-    def load(self, voice: str) -> None:
+    def choose_voice(self, voice: str) -> None:
         """Choose the voice for the next sentences."""
         current: Synthesizer = self._get_piper() if is_neural(voice) else self._espeak
-        current.load(voice)
+        current.choose_voice(voice)
         self._current, self.voice = current, current.voice
 
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
@@ -73,7 +73,7 @@ class CombinedSynthesizer:
                     raise
                 traceback.print_exc()  # Log the bug, and let the other synthesizer speak instead.
                 self._fallback_reason = f"{neural.voice} failed: {type(error).__name__}: {error}"
-        self._espeak.load_language(neural.language)
+        self._espeak.choose_language(neural.language)
         self._espeak.speak(text, settings, sink, self._fallback_reason)
 
     @property
@@ -85,9 +85,9 @@ class CombinedSynthesizer:
         """Start loading a neural voice in the background, or unload one."""
         loader = self._get_piper().loader
         if isinstance(command, protocol.DropVoice):
-            loader.drop(command.voice)
+            loader.unload(command.voice)
         else:
-            loader.start(command.voice)
+            loader.queue(command.voice)
 
     def _get_piper(self) -> Piper:
         """Return the synthesizer for neural voices. The first call creates it."""

@@ -173,16 +173,16 @@ class Espeak:
 
     def voices(self) -> tuple[Voice, ...]:
         """Return the normal voices, the installed MBROLA voices, and the variants."""
-        self._stop_phonemizer()
+        self._finish_phonemizer()
         return (*_list_voices(self._espeak, None), *_list_mbrola_voices(self._espeak), *_list_variants(self._espeak))
 
-    def load(self, voice: str) -> None:
-        """Load a voice by its id or by another name known to the library.
+    def choose_voice(self, voice: str) -> None:
+        """Choose a voice by its id or by another name known to the library.
 
         Raises:
             UnknownVoice: One of the voice's files is missing. The library keeps the previous voice.
         """
-        self._stop_phonemizer()
+        self._finish_phonemizer()
         # Forget the rate, so that it is set again. Otherwise some voices would make the next one up to a third slower.
         self._parameters.clear()
         if not voice or self._espeak.SetVoiceByName(voice.encode("utf-8", "replace")) != self._espeak.EE_OK:
@@ -193,12 +193,12 @@ class Espeak:
         self.voice = voice
 
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink, fallback_reason: str | None = None) -> None:
-        """Synthesize a sentence, and write it to the sink.
+        """Synthesize a sentence, and pass its samples and words to the sink.
 
         The samples vary slightly from call to call. If another voice was requested, `fallback_reason` is a message
         saying why it is not used.
         """
-        self._stop_phonemizer()
+        self._finish_phonemizer()
         sink.begin(self._rate, self.voice, fallback_reason)
         espeak = self._espeak
         self._set_parameters(settings)
@@ -232,11 +232,11 @@ class Espeak:
         if status != espeak.EE_OK:
             raise CannotSpeak(Reason.ENGINE_FAILED, f"espeak_Synth failed with {status}")
 
-    def load_language(self, language: str) -> None:
-        """Load the best voice for a language code such as "de-at"."""
-        self._stop_phonemizer()
+    def choose_language(self, language: str) -> None:
+        """Choose the best voice for a language code such as "de-at", or English if there is none."""
+        self._finish_phonemizer()
         found = (self._find_voice(each) for each in (language, language.partition("-")[0], *_ENGLISH))
-        self.load(next((each.id for each in found if each), self.voice))
+        self.choose_voice(next((each.id for each in found if each), self.voice))
 
     @contextlib.contextmanager
     def phonemizer(self, language: str) -> Iterator[EspeakPhonemizer]:
@@ -250,7 +250,7 @@ class Espeak:
         Raises:
             UnknownVoice: The library has no voice of this language.
         """
-        self._stop_phonemizer()
+        self._finish_phonemizer()
         voice = self._find_voice(language)
         voice_id = voice.id if voice is not None else ""
         self._phonemizer = phonemizer = EspeakPhonemizer(self._espeak, voice_id)
@@ -263,12 +263,12 @@ class Espeak:
             phonemizer.end()
 
     def _find_voice(self, name: str) -> Voice | None:
-        """Find a voice by its name or language. Return None if there is none."""
+        """Return the library's voice with this name or language, or None if there is none."""
         self._listed = self._listed or _list_voices(self._espeak, None)
         return find_voice(name, self._listed)
 
-    def _stop_phonemizer(self) -> None:
-        """Wait for the last phonemizer to finish, and restore the synthesizer's voice."""
+    def _finish_phonemizer(self) -> None:
+        """Wait until the last phonemizer has finished its call, and restore the synthesizer's voice."""
         phonemizer, self._phonemizer = self._phonemizer, None
         if phonemizer is not None:
             with phonemizer.busy:  # The phonemizer's last call may still be running.

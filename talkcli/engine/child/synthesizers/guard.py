@@ -167,7 +167,7 @@ def _is_letter(character: str) -> bool:
 
 
 def _utf8_bytes(text: str) -> int:
-    """Return the length of a text in UTF-8.
+    """Return the number of bytes that a text has in UTF-8.
 
     A lone surrogate counts as one byte, because it is replaced.
     """
@@ -198,7 +198,7 @@ def _blank_crashing_hyphens(text: str) -> str:
 
 
 def _split_word(match: re.Match[str]) -> str:
-    """Split a matched word if it is too long for the library or has too many apostrophes.
+    """Return a matched word, split if it is too long for the library or has too many apostrophes.
 
     The length stays the same: apostrophes become blanks, or pairs of letters change case.
     """

@@ -165,7 +165,7 @@ class ModelRun:
         self.options.log_severity_level = 4  # Log only fatal errors. Other errors raise exceptions.
 
     def end(self) -> None:
-        """Stop the model. The current run and all later ones raise an exception.
+        """Stop the model. All runs with this handle raise VoiceFileError from now on.
 
         Any thread may call this.
         """
@@ -313,7 +313,7 @@ class Model:
 
 
 def load_libraries(model_path: str) -> None:
-    """Import numpy and onnxruntime. If this fails, the error names the model that needs them.
+    """Import numpy and onnxruntime. If this fails, raise an error that names the model.
 
     This takes 0.25 s, and blocks all other threads for a tenth of that time.
 
@@ -347,7 +347,7 @@ def _split_and_cache(path: str, content: bytes, cache: ModelCache | None, key: s
 
 
 def _create_half_session(half: Sequence[Buffer], save_optimized_to: str | None = None) -> Any:
-    """Create an onnxruntime session for one half of a model.
+    """Create an onnxruntime session from the content of one half of a model.
 
     onnxruntime reads the half from a temporary file in memory. To pass bytes instead, the parts would have to be
     joined, and onnxruntime would keep a copy of them. For the voice joe, each of these steps takes 30 to 110 ms, during

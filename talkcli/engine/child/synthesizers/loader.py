@@ -73,19 +73,19 @@ class BackgroundIterator(threading.Thread, Generic[_T]):
         """Whether `take` would return without waiting."""
         return bool(self._made)
 
-    def take(self, wait: Callable[[int], None] | None = None) -> _T | None:
+    def take(self, wait_readable: Callable[[int], None] | None = None) -> _T | None:
         """Wait for the next item. Return the item, or None at the end.
 
         Args:
-            wait: A function that waits until the descriptor is readable, or for a shorter time. If it raises an
-                exception, no item is lost. It isn't needed if `ready` is True.
+            wait_readable: A function that waits until the descriptor is readable, or for a shorter time. If it raises
+                an exception, no item is lost. It isn't needed if `ready` is True.
 
         Raises:
             BaseException: The iterator raised this exception.
         """
         while not self._made:
-            assert wait is not None
-            wait(self.descriptor)
+            assert wait_readable is not None
+            wait_readable(self.descriptor)
         item, error = self._made[0]
         if error is not None:
             raise error
@@ -136,15 +136,15 @@ class ModelLoader:
 
     @property
     def descriptor(self) -> int | None:
-        """A descriptor that becomes readable when the load has finished."""
+        """The descriptor that becomes readable when the current load ends, or None if nothing is loading."""
         return self._load.descriptor if self._load else None
 
     @property
     def deadline(self) -> float:
-        """The time limit for the current load (monotonic time)."""
+        """The monotonic time at which the current load times out."""
         return self._started_at + LOAD_LIMIT_S
 
-    def drop(self, voice: str) -> None:
+    def unload(self, voice: str) -> None:
         """Unload a voice, and forget its error.
 
         If the voice is speaking, its memory is freed after the sentence.
@@ -153,8 +153,8 @@ class ModelLoader:
             self._unmeasured = ""
         self.errors.pop(voice, None)
 
-    def start(self, voice: str) -> None:
-        """Queue a voice for loading, or add an event if it is already loaded.
+    def queue(self, voice: str) -> None:
+        """Queue a voice for loading. If it is already loaded, only add a VoiceLoaded event.
 
         When the load begins, any earlier error of the voice is forgotten.
         """
@@ -166,14 +166,14 @@ class ModelLoader:
             self._start_next_load()
 
     def get_model(self, voice: str) -> Model | None:
-        """Return the model of a voice if it is loaded. Handle a finished load first.
+        """Store the result of a finished load. Return the model of a voice, or None if it isn't loaded.
 
         If the voice has failed and its files have changed since then, unload it.
         """
         self._finish_load()
         model, fingerprints = self._models.get(voice, (None, ()))
         if model and voice in self.errors and fingerprints != _fingerprints(model.path):
-            self.drop(voice)
+            self.unload(voice)
             self._events.append(VoiceUnloaded(voice))
             return None
         return model
@@ -189,7 +189,7 @@ class ModelLoader:
             self._unmeasured = voice
 
     def take_events(self) -> list[VoiceLoaded | VoiceUnloaded | VoiceMemory]:
-        """Handle a finished load, and measure memory if due. Return and clear the new events."""
+        """Store the result of a finished load, and measure memory if due. Return and clear the new events."""
         self._finish_load()
         if self._unmeasured is not None:
             self._measure_memory(self._unmeasured, min_growth=GROWTH_BYTES)
@@ -223,7 +223,7 @@ class ModelLoader:
         self._start_next_load()
 
     def _measure_memory(self, voice: str, min_growth: float = -math.inf) -> None:
-        """Measure the memory used by all voices. Add an event if it has grown enough.
+        """Measure the memory used by all voices. If it has grown enough, trim the heap and add an event.
 
         `voice` was just loaded or used. It is empty if a voice was unloaded. In that case, or if the memory has grown
         by at least `min_growth` bytes since the last event, free unused memory and add an event.

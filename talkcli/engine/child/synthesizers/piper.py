@@ -103,7 +103,7 @@ class Piper:
         """Return all installed neural voices."""
         return models.installed_voices()
 
-    def load(self, voice: str) -> None:
+    def choose_voice(self, voice: str) -> None:
         """Choose a voice by its id, which may end with "#" and a speaker.
 
         If a file of the voice is faulty, `speak` reports the error later.
@@ -123,7 +123,7 @@ class Piper:
         self.voice, self._model_id, self._speaker, self._path = voice, model, speaker, path
 
     def speak(self, text: str, settings: SpeechSettings, sink: SampleSink) -> None:
-        """Load the voice if necessary, synthesize a sentence, and write it to the sink.
+        """Load the voice if necessary, synthesize a sentence, and pass its samples and words to the sink.
 
         The samples vary from call to call, unless the description of the voice sets its noise to 0.
         """
@@ -163,7 +163,7 @@ class Piper:
         """
         loader = self.loader
         if loader.get_model(voice) is None:
-            loader.start(voice)  # Try again even after an error, because the files may have been repaired.
+            loader.queue(voice)  # Try again even after an error, because the files may have been repaired.
         while (model := loader.get_model(voice)) is None:
             if voice in loader.errors:
                 raise CannotSpeak(Reason.VOICE_FAILED, loader.errors[voice])
@@ -241,7 +241,7 @@ def _speak_parts(
 
 
 def _word_time(
-    model: Model, part: SpeechPart, id_indexes: Sequence[int], id_frames: Sequence[int], start: int
+    model: Model, part: SpeechPart, id_indexes: Sequence[int], id_frames: Sequence[int], phoneme: int
 ) -> float:
     """Return the time at which a word is heard, in seconds from the start of its part.
 
@@ -254,11 +254,11 @@ def _word_time(
         part: The part of the text.
         id_indexes: For each phoneme, the index of its first id.
         id_frames: For each id, the frame at which it begins.
-        start: The index of the word's first phoneme.
+        phoneme: The index of the word's first phoneme.
     """
-    own = id_frames[id_indexes[start]]
-    if start >= 2 and part.phonemes[start - 1] == " " and part.phonemes[start - 2] not in PAUSE_MARKS:
-        end = id_frames[id_indexes[start - 1] - len(model.description.phoneme_ids[PAD_SYMBOL])]
+    own = id_frames[id_indexes[phoneme]]
+    if phoneme >= 2 and part.phonemes[phoneme - 1] == " " and part.phonemes[phoneme - 2] not in PAUSE_MARKS:
+        end = id_frames[id_indexes[phoneme - 1] - len(model.description.phoneme_ids[PAD_SYMBOL])]
         if model.seconds(own - end) < _WORD_GAP_S:
             return model.seconds(end)
     return model.seconds(own)

@@ -247,7 +247,7 @@ def _names(fields: Iterable[Field], field_number: int) -> list[str]:
 
 
 def _parse_integer(raw: Buffer, at: int) -> tuple[int, int]:
-    """Decode an integer. Return the integer and the index of the next byte."""
+    """Decode the protobuf varint at an index. Return its value and the index of the next byte."""
     result = shift = 0
     while at < len(raw) and shift < 64:  # Longer integers aren't valid.
         byte = raw[at]
