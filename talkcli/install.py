@@ -35,7 +35,7 @@ class Environment:
 
 
 def command(*packages: str, reinstall: bool = False) -> str:
-    """Return the shell command that installs the named packages into this process's environment.
+    """Return the shell command that installs packages into this process's Python environment.
 
     Args:
         packages: names of the packages.
@@ -55,7 +55,7 @@ def neural_command(*more: str, reinstall: bool = False) -> str:
 
 
 def espeak_command() -> str:
-    """Return the shell command or commands that install libespeak-ng."""
+    """Return one or two alternative shell commands that install libespeak-ng, as a single text."""
     package = "sudo apt-get install -y libespeak-ng1"
     return f"{package}, or {command('espeakng-loader')}" if IS_64_BIT else package
 

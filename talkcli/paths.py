@@ -34,12 +34,9 @@ def named_socket(option: str | None) -> str | None:
 
 
 def named_robot(option: str | None, socket: str | None) -> str | None:
-    """Return the robot's name from --robot or TALK_ROBOT, if one is set.
+    """Return the robot's name from --robot, or from TALK_ROBOT unless --socket is given.
 
-    TALK_ROBOT is ignored if --socket is given.
-
-    Both options take precedence over the variables, and TALK_ROBOT over
-    TALK_SOCKET.
+    Return None if none is set. Both options take precedence over the variables, and TALK_ROBOT over TALK_SOCKET.
     """
     return option or (None if socket else os.environ.get("TALK_ROBOT") or None)
 
@@ -97,7 +94,7 @@ def _runtime_directories(uid: int) -> list[str]:
 
 
 def sudo_caller(environment: Mapping[str, str]) -> int | None:
-    """Return the id of the user who ran sudo, if any."""
+    """Return the id of the user who started this process through sudo, if any."""
     caller = environment.get("SUDO_UID", "")
     return int(caller) if os.getuid() == 0 and caller.isdecimal() else None
 

@@ -774,7 +774,7 @@ class Scheduler:
 
     def _start_time(self, record: Record) -> float:
         """Return the earliest monotonic time at which a goal may start instead of waiting for its voice."""
-        return self.voices.start_time(record, self.settings.voice) if self._loads_voices else 0.0
+        return self.voices.patience_end(record, self.settings.voice) if self._loads_voices else 0.0
 
     def _start_next(self, now: Now) -> list[Effect]:
         """Start the next goal if possible. Return the effects.

@@ -43,7 +43,7 @@ class VoiceState(Enum):
 
 @dataclass(slots=True)
 class NeuralVoice:
-    """A neural voice that a goal has requested."""
+    """The loading state, failures and memory use of a requested neural voice."""
 
     #: measured memory use, or the size of the voice's file if it hasn't been measured yet
     size_bytes: int
@@ -119,7 +119,7 @@ class VoiceScheduler:
     # -- requests from goals
 
     def request(self, voice: str, now: float) -> None:
-        """Record that a goal asks for a voice, and plan to load it.
+        """Mark a voice as the most recently requested one, and plan to load it if necessary.
 
         A failed voice is retried after a delay.
         """
@@ -134,11 +134,11 @@ class VoiceScheduler:
         if found and found.state is VoiceState.FAILED and voice != self._loading:
             del self._voices[voice]
 
-    def start_time(self, record: Record, default_voice: str | None) -> float:
-        """Return the monotonic time at which the next goal stops waiting for its voice.
+    def patience_end(self, record: Record, default_voice: str | None) -> float:
+        """Return when the next goal stops waiting for its voice (monotonic), or 0 if it doesn't wait.
 
-        Return 0 if the goal doesn't wait. Urgent goals don't wait. Other goals stop waiting before they expire. A
-        `voice_only` goal waits until its voice is loaded or has failed.
+        Urgent goals don't wait. Other goals stop waiting before they expire. A `voice_only` goal waits until its voice
+        is loaded or has failed.
 
         Args:
             record: the next goal.
@@ -155,7 +155,7 @@ class VoiceScheduler:
         return min(start, record.expires_at - EXPIRY_MARGIN_S)
 
     def failure(self, voice: str) -> str | None:
-        """Return the reason why a voice failed to load, if it did."""
+        """Return the reason why a voice failed to load, or None if it didn't fail."""
         found = self._voices.get(voice)
         return found.why if found and found.state is VoiceState.FAILED else None
 
@@ -171,10 +171,11 @@ class VoiceScheduler:
         return self._loading is None and any(each.wanted for each in self._voices.values())
 
     def load_next(self, needed: Sequence[str], default_voice: str, now: float) -> VoiceLoadOrder | None:
-        """Mark the next voice as loading. Return the order to load it, if any.
+        """Choose the next voice to load and the voices to drop for it. Return the order, if any.
 
-        Return None if no voice can be loaded now. Call this only if `can_load` is true. A loaded voice is not dropped
-        if a goal needs it sooner than the next voice, because it would have to be loaded again.
+        Mark the voice as loading and the others as dropped. Return None if no voice can be loaded now. Call this only
+        if `can_load` is true. A loaded voice is not dropped if a goal needs it sooner than the next voice, because it
+        would have to be loaded again.
 
         Args:
             needed: the voices that waiting goals need, in the order of the goals.
@@ -196,7 +197,7 @@ class VoiceScheduler:
                 for each in drop:
                     self.unloaded(each, needed)
                 return VoiceLoadOrder(voice, drop)
-        self._forget_unneeded((*needed, default_voice))
+        self._cancel_unneeded_loads((*needed, default_voice))
         return None
 
     def drop_excess(self, kept_voice: str, needed: Sequence[str]) -> list[VoiceDropOrder | VoiceWarning]:
@@ -259,7 +260,10 @@ class VoiceScheduler:
             self._voices[voice] = NeuralVoice(found.size_bytes)
 
     def engine_lost(self, now: float) -> list[VoiceWarning]:
-        """Record that the engine process has exited. Return a warning if a voice is the cause."""
+        """Forget the loaded voices after the engine process exits. Return a warning if one is to blame.
+
+        A voice is to blame if the engine has died repeatedly while loading it.
+        """
         suspect, self._loading, self.has_libraries = self._loading, None, False
         self._reported_bytes = self._used_bytes = 0
         for voice, found in list(self._voices.items()):
@@ -287,9 +291,9 @@ class VoiceScheduler:
         return max(self._used_bytes, sum(self._loaded_bytes().values()))
 
     def _voices_to_drop(self, size_bytes: int, keep: Collection[str]) -> tuple[str, ...] | None:
-        """Return the voices to drop to make room for a new one.
+        """Return the voices to drop to make room for a new one, or None if it can't fit.
 
-        Return None if there can't be enough room. The least recently used voices are dropped first.
+        The least recently used voices are dropped first.
 
         Args:
             size_bytes: the memory use of the new voice.
@@ -314,7 +318,7 @@ class VoiceScheduler:
         self._voices[voice].why = why
         return [VoiceWarning(f"voice {voice}: {why}")]
 
-    def _forget_unneeded(self, needed: Collection[str]) -> None:
+    def _cancel_unneeded_loads(self, needed: Collection[str]) -> None:
         """Cancel all plans to load voices that are not in `needed`."""
         for voice, found in list(self._voices.items()):
             if found.wanted and voice not in needed:
@@ -323,5 +327,5 @@ class VoiceScheduler:
                     del self._voices[voice]
 
     def _new_voice(self, voice: str) -> NeuralVoice:
-        """Create the entry for a voice that is not loaded yet."""
+        """Return a new entry for a voice that is not loaded yet, with its expected memory use."""
         return NeuralVoice(self._measured_bytes.get(voice) or self._file_size(voice))

@@ -130,7 +130,7 @@ class WordHeard:
 
 @frozen
 class TextAdded:
-    """Event sent to watching clients when a text has grown."""
+    """Event sent to watching clients when a goal's text has grown."""
 
     id: str
     #: position of the new text in the goal's text
@@ -246,7 +246,7 @@ def _event_json(kind: str, event: StateChanged | WordHeard | TextAdded | TextMis
 
 
 def goals(items: list[JsonObject], name: str) -> Iterator[Goal]:
-    """Yield the goal in the field `name` of each list item. Raise Unreadable if one is malformed."""
+    """Yield the goals in the field `name` of list items. Raise Unreadable if one is malformed."""
     return (Goal.from_json(each[name]) for each in items if name in each)
 
 
@@ -298,7 +298,7 @@ def check_greeting(message: JsonObject) -> None:
 
 
 def item(seq: int | None, **fields: object) -> JsonObject:
-    """Return the message for a list item that belongs to the request `seq`.
+    """Return the message for a list item: the given fields, and the request's `seq`, if any.
 
     List items are sent before the reply.
     """

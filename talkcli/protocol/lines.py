@@ -93,7 +93,7 @@ def request_to_json(request: Request) -> JsonObject:
 
 
 def request_line(message: JsonObject) -> bytes:
-    """Encode an object as a line of JSON. If possible, don't import `json`."""
+    """Encode a request as a line of JSON, without importing `json` if possible."""
     try:
         shown = ", ".join(f'"{name}": {_encode_simple(value)}' for name, value in message.items())
         return f"{{{shown}}}\n".encode()

@@ -59,7 +59,7 @@ class Handler(Protocol):
     greeting: bytes
 
     def joined(self, connection: ClientConnection) -> None:
-        """Admit a new client, keep it waiting, or refuse it."""
+        """Admit a new client, let it wait because the server is full, or refuse it."""
 
     def left(self, connection: ClientConnection) -> None:
         """Remove a client that has disconnected."""
@@ -259,7 +259,7 @@ class ClientConnection(asyncio.Protocol):
         self._work()
 
     def eof_received(self) -> None:
-        """Close the connection once the client has received all answers."""
+        """Record the end of the client's input. Close the connection once all answers are sent."""
         self._half_closed = True
         self._work()
 
@@ -298,9 +298,9 @@ class ClientConnection(asyncio.Protocol):
         self._schedule_work()
 
     def publish(self, event: bytes, *, feedback: bool = False) -> None:
-        """Send an encoded event, but hold back feedback if the client reads too slowly.
+        """Send an encoded event. If it is feedback and the client reads too slowly, hold it back.
 
-        Only the newest held feedback is kept.
+        Only the newest feedback is kept, and older feedback is dropped.
         """
         if feedback and self.stream.congested:
             self._held_feedback = event
@@ -309,7 +309,7 @@ class ClientConnection(asyncio.Protocol):
             self.send(held + event)
 
     def detect_hang_up(self) -> bool:
-        """Send pending output. Return whether the client has closed its socket."""
+        """Send pending output to find out whether the connection is closing. Return whether it is."""
         self.stream.flush()
         return self.stream.closing
 

@@ -334,14 +334,15 @@ def _open_lock(path: str) -> int:
             with contextlib.suppress(FileExistsError):
                 return os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o600)
             with contextlib.suppress(FileNotFoundError):  # the file has just been removed, so try again
-                _refuse_other_lock(path, os.lstat(path))  # check first, because opening a device may have side effects
+                # Check before opening the file, because opening a device may have side effects.
+                _refuse_irregular_lock(path, os.lstat(path))
                 fd = os.open(path, flags)
-                _refuse_other_lock(path, os.fstat(fd))
+                _refuse_irregular_lock(path, os.fstat(fd))
                 return fd
 
 
-def _refuse_other_lock(path: str, status: os.stat_result) -> None:
-    """Raise AddressInUse unless the file is a regular file without other hard links."""
+def _refuse_irregular_lock(path: str, status: os.stat_result) -> None:
+    """Raise AddressInUse unless the lock file is a regular file without other hard links."""
     if stat.S_ISLNK(status.st_mode):
         what = "a symbolic link"
     elif not stat.S_ISREG(status.st_mode):
@@ -365,7 +366,7 @@ def _process_exists(pid: int) -> bool:
 
 
 def _read_holder(fd: int) -> int | None:
-    """Wait briefly for the process id in a lock file. Return it, if any.
+    """Wait briefly for a running process's id in a lock file. Return the id, if any.
 
     The id of a process that no longer exists was written by an earlier server, and is ignored.
     """

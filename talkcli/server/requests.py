@@ -82,7 +82,7 @@ class Requests:
         return bool(connection.unanswered) or self._speech.subscribers.is_subscribed(connection)
 
     def left(self, connection: ClientConnection) -> None:
-        """Drop the requests, subscriptions and incomplete texts of a disconnected client."""
+        """Drop a disconnected client's requests and subscriptions, and treat its input as ended."""
         for each in list(connection.unanswered):
             each.drop()
         self._speech.subscribers.left(connection)
@@ -95,14 +95,14 @@ class Requests:
             self._speech.apply(self._scheduler.producer_left(record, self._speech.advance_time()))
 
     def shut_down(self) -> None:
-        """End all goals, including waiting ones, and reject new ones."""
+        """End all goals, including those that are not in the queue yet, and reject new ones."""
         notifications = self._mark_canceled(self._select_waiting(Cancel()), None)
         self._speech.shut_down()
         resume_all(self._speech.waiting_for_voices)
         self._speech.notifications.add(notifications)
 
     async def _carry_out(self, pending: PendingRequest) -> None:
-        """Carry out a request, and reply with an error if it fails."""
+        """Carry out a request, if necessary after the voices are listed. Reply with any error."""
         request = pending.request
         try:
             if isinstance(request, Cancel | Pause):
@@ -138,7 +138,7 @@ class Requests:
         return self._speech.awaits_voices and (names_voice or isinstance(request, Voices))
 
     def _stop_awaiting_voices(self, connection: ClientConnection) -> None:
-        """Resume a connection's requests that are waiting for the list of voices."""
+        """Continue a connection's requests that wait for the list of voices, without the list."""
         for each in self._awaiting_voices(connection):
             each.resume()
 
@@ -162,7 +162,7 @@ class Requests:
         return False
 
     def _schedule_room_check(self) -> None:
-        """Schedule a check of the goals that wait for room, if there are any."""
+        """Schedule a check of the goals that wait for room in the queue, if there are any."""
         if self._speech.waiting_for_room and self._room_check is None:
             # Check in the next iteration of the event loop, because the caller may not have finished its changes.
             self._room_check = asyncio.get_running_loop().call_soon(self._submit_waiting_goals)
@@ -205,7 +205,7 @@ class Requests:
         return [each.resume for each in new]
 
     async def _await_room(self, pending: PendingRequest, say: Say) -> float:
-        """Wait until the queue has room or the goal expires. Return the waiting time in seconds."""
+        """Wait until the queue has room, or the goal expires or is cancelled. Return the seconds waited."""
         ttl = (self._scheduler.settings.ttl if say.ttl is None else say.ttl) or None
         began = self._speech.advance_time().monotonic
         self._speech.subscribers.schedule_keep_alive()
@@ -277,7 +277,7 @@ class Requests:
         pending.answer(length=len(record.say.text), state=record.state.name)
 
     def _require_producer(self, record: Record, connection: ClientConnection) -> None:
-        """Let a connection add text to a goal. Raise RequestRefused if another one already does.
+        """Make a connection the only one that adds text to a goal. Raise RequestRefused if another does.
 
         A new connection may continue a text if the old one is gone and the sender chose the goal's id.
         """
@@ -324,7 +324,7 @@ class Requests:
         pending.answer(({"goal": each.to_json()} for each in goals), results, count=len(records))
 
     async def _cancel(self, pending: PendingRequest, selection: Cancel) -> None:
-        """Cancel goals, and reply when the active one is silent."""
+        """Cancel goals, and reply when all of them have ended."""
         speech, client = self._speech, pending.connection.client
         now = speech.advance_time()
         waiting = self._select_waiting(selection)

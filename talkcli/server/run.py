@@ -131,7 +131,7 @@ class Server:
         self._end_signals = [signal.SIGTERM] if ignored else [signal.SIGTERM, signal.SIGINT]
 
     async def run(self) -> None:
-        """Run the server until a signal or an error stops it."""
+        """Run the server until a signal stops it. If an error stops it, raise the error."""
         settings, speech = self._settings, self.speech
         descriptors = raise_descriptor_limit(settings.max_clients + MAX_EXTRA_CLIENTS)
         self._acceptor = Acceptor(lambda each: ClientConnection(self, speech.streams, each).begin(), descriptors)
@@ -228,7 +228,7 @@ class Server:
     # -- called by connections
 
     def joined(self, connection: ClientConnection) -> None:
-        """Admit a new client, keep it waiting, or refuse it."""
+        """Admit a new client, let it wait because the server is full, or refuse it."""
         pid, uid = peers.credentials(connection.stream.socket)
         # Other users may connect only if the socket's mode allows it.
         if uid not in {os.getuid(), 0} and not self._listener.mode & 0o066:

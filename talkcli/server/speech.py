@@ -128,7 +128,7 @@ class Speech:
         self._announced_next = False, False
 
     def status_message(self) -> str:
-        """Return a short status message that every user may read."""
+        """Return a short status for `systemctl status`, which every user may read."""
         scheduler, ready = self.scheduler, self.ready
         if self.engine_status != READY:
             doing = f"engine: {self.engine_status}"
@@ -250,7 +250,7 @@ class Speech:
         return following is not None, following is not None and is_neural(self.scheduler.wanted_voice(following))
 
     def _publish_change(self, record: Record, state: State, at: float) -> None:
-        """Publish a goal's new state. If it has ended, log it and resume waiting requests."""
+        """Publish a goal's new state. If it has ended, log it and resume the requests that wait for it."""
         self.subscribers.state_changed(record, state, at)
         if state.terminal:
             _log_goal_end(record, monotonic_now() - record.began_at)

@@ -67,14 +67,14 @@ class ClientStreams:
         self._written: dict[ClientStream, None] = {}
 
     def shed_load(self) -> None:
-        """Disconnect the slowest readers until the unread output is below the limit."""
+        """Disconnect the clients with the most unread output until the total is within the limit."""
         while self.unread_bytes > MAX_TOTAL_OUTPUT_BYTES and self.open:
             max(self.open, key=lambda each: each.unsent_bytes + each.held_bytes).abort()
             total = MAX_TOTAL_OUTPUT_BYTES >> 20
             log.write_limited("output", f"disconnected a client that doesn't read ({total} MiB are unread in total)")
 
     def flush_later(self, stream: ClientStream) -> None:
-        """Send a stream's output at the end of this iteration of the event loop."""
+        """Schedule a stream's output to be sent at the end of this iteration of the event loop."""
         if not self._written:
             self.loop.call_soon(self._flush_written)
         self._written[stream] = None
@@ -172,7 +172,7 @@ class ClientStream:
         return len(self._unread)
 
     def adjust_held_bytes(self, added_bytes: int) -> None:
-        """Count output that the receiver holds back. Disconnect slow clients above the total limit."""
+        """Change the size of the receiver's held output. Disconnect slow clients above the total limit."""
         if self in self._streams.open:
             self.held_bytes += added_bytes
             self._streams.unread_bytes += added_bytes
@@ -271,7 +271,7 @@ class ClientStream:
 
 
 def raise_descriptor_limit(clients: int) -> int:
-    """Raise the limit of open files to fit this number of clients. Return the limit."""
+    """Raise the limit of open files for this many clients, as far as allowed. Return the limit."""
     wanted = clients + RESERVED_DESCRIPTORS + OWN_DESCRIPTORS
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     allowed, most = (2**31 if each == resource.RLIM_INFINITY else each for each in limits)

@@ -141,7 +141,7 @@ class Subscribers:
         return listeners
 
     def _send_alive(self) -> None:
-        """Send a keep-alive message to all waiting clients, and schedule the next one."""
+        """Send a keep-alive message to all clients that watch or wait, and schedule the next one."""
         self._alive_timer = None
         listeners = dict.fromkeys(chain(self._watchers, self._waiting_for_room(), *self._waiters.values()))
         _publish({"event": "alive"}, listeners)

@@ -295,9 +295,9 @@ def _describe_cause(by: By) -> str:
 
 
 def listed_reason_forms(goal: Goal, screen: Screen) -> list[str]:
-    """Return descriptions of why a listed goal ended, longest first, usually without its duration.
+    """Return descriptions of why a goal ended, longest first. Show a duration only with `screen.long`.
 
-    The duration is only shown with `screen.long`.
+    The duration of a goal is shown instead of a reason if the goal succeeded.
     """
     if goal.state is State.SUCCEEDED and not screen.long:
         return _muted_note(goal) or [""]
@@ -338,7 +338,7 @@ def _describe_output(output: Output) -> str:
 
 
 def _muted_note(goal: Goal) -> list[str]:
-    """Return a list with a note if the goal's output was muted."""
+    """Return ["muted"] if the goal's output was muted, or an empty list."""
     return ["muted"] if goal.output and goal.output.muted else []
 
 

@@ -96,7 +96,7 @@ class Screen:
         return self.fit_name(number if number.isdecimal() else goal_id, _MIN_ID_COLUMNS, 8)
 
     def coloured(self, text: str, state: State | None) -> str:
-        """Colour a text by a goal state, or make it bold if the state is None.
+        """Give a text the colour of a goal state, or make it bold if the state is None.
 
         Without colours, return it unchanged.
         """
@@ -162,7 +162,7 @@ def longest_fitting(forms: Sequence[str], columns: int | None) -> str:
 
 
 def room_beside(text: str, columns: int, screen: Screen) -> int:
-    """Return how many columns the details beside a text may take up.
+    """Return how many of the `columns` the details beside a text may take up.
 
     The details leave at least half of the line to the text, or 16 columns if whole ids are shown.
     """
@@ -226,7 +226,7 @@ class MeasuredText:
         return self._slice(0, heard), self._slice(heard, len(self._shown))
 
     def view(self, start: int, end: int, columns: int) -> tuple[str, str, str]:
-        """Return as much of the text around a word as fits into `columns`.
+        """Return the text before a word, the word, and the text after it, cut to fit into `columns`.
 
         Args:
             start: the index of the word's first character.

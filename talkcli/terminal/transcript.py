@@ -57,7 +57,7 @@ class ColumnWidths:
         self._ids, self._robots = _FIRST_ID_COLUMNS, _FIRST_NAME_COLUMNS
 
     def pad_robot(self, name: str, screen: Screen) -> str:
-        """Pad a robot's name. Widen its column if necessary.
+        """Shorten and pad a robot's name. Widen its column if necessary.
 
         The name takes up at most a sixth of the terminal.
         """
