@@ -1,6 +1,7 @@
 """The calls of a client as coroutines, which the blocking and the asyncio client share.
 
-A coroutine waits only with `Connection.ask` and `Connection.until`. The blocking client runs it with `run_blocking`.
+A coroutine waits only with `Connection.request` and `Connection.until`. The blocking client runs it with
+`run_blocking`.
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ class ClientCalls:
         unknown: list[str] = []
         for request in requests:
             try:
-                items += (await self._connection.ask(request))[1]
+                items += (await self._connection.request(request))[1]
             except UnknownGoal as error:
                 items += error.items
                 unknown.append(error.message)
@@ -97,23 +98,23 @@ class ClientCalls:
 
     async def status(self) -> ServerStatus:
         """Return the state of the server, with its active, pending and recent goals."""
-        return ServerStatus.from_reply(*await self._connection.ask(Status()))
+        return ServerStatus.from_reply(*await self._connection.request(Status()))
 
     async def goal(self, goal_id: str) -> Goal:
         """Return a goal in its current state. Raise UnknownGoal if the server doesn't know it."""
-        reply, _ = await self._connection.ask(Status(self._full_id(goal_id)))
+        reply, _ = await self._connection.request(Status(self._full_id(goal_id)))
         return Goal.from_json(reply.get("goal"))
 
     async def log(self, count: int = 20) -> list[Goal]:
         """Return the most recently ended goals, including REJECTED ones, oldest first."""
         if not 0 < count <= MAX_LOG_GOALS:
             raise UsageError(f"the count must be 1 to {MAX_LOG_GOALS:,}, got {count}")
-        _, items = await self._connection.ask(Log(count))
+        _, items = await self._connection.request(Log(count))
         return list(goals(items, "goal"))
 
     async def voices(self) -> list[JsonObject]:
         """Return the voices of the server's engine."""
-        _, items = await self._connection.ask(Voices())
+        _, items = await self._connection.request(Voices())
         return [each["voice"] for each in items if isinstance(each.get("voice"), dict)]  # type: ignore[misc]
 
     async def settings(self) -> JsonObject:
@@ -132,17 +133,17 @@ class ClientCalls:
         """Change the server's settings. Return all settings."""
         request = Set(rate, volume, voice, pitch, preempt, ttl)
         check(request)
-        reply, _ = await self._connection.ask(request)
+        reply, _ = await self._connection.request(request)
         settings = reply.get("settings")
         return settings if isinstance(settings, dict) else {}
 
     async def pause(self) -> Goal | None:
         """Pause all speech, and wait until it has stopped. Return the paused goal, if any."""
-        return goal_in((await self._connection.ask(Pause()))[0])
+        return goal_in((await self._connection.request(Pause()))[0])
 
     async def resume(self) -> Goal | None:
         """Resume speech. Return the resumed goal, if any."""
-        return goal_in((await self._connection.ask(Resume()))[0])
+        return goal_in((await self._connection.request(Resume()))[0])
 
     # -- calls that clients adapt, because their results depend on the client
 
@@ -164,7 +165,7 @@ class ClientCalls:
         if handle.state.terminal:
             return handle
         if block:
-            await self._connection.ask(request, accepted)
+            await self._connection.request(request, accepted)
         else:
             handle._set_request(request, time.monotonic())
             self._connection.submit(request, accepted, handle._fail)
@@ -195,7 +196,7 @@ class ClientCalls:
                 handles[goal.id]._listen(feedback=feedback)
 
         for some in [None] if wanted is None else batches(wanted):
-            await self._connection.ask(Wait(some, feedback), accepted)
+            await self._connection.request(Wait(some, feedback), accepted)
         return list(handles.values()) if wanted is None else [handles[each] for each in wanted]
 
     async def _watch(self, *, reconnect: bool) -> Callable[[], Coroutine[Any, Any, Event]]:
@@ -209,7 +210,7 @@ class ClientCalls:
             buffer.add(Snapshot(ServerStatus.from_reply(reply, items)))
             self._connection.listeners.watches.add(buffer)
 
-        await self._connection.ask(Watch(), accepted)
+        await self._connection.request(Watch(), accepted)
         read = event_reader(self._connection, lambda: buffer.take() or buffer.closed, None)
 
         async def next_event() -> Event:

@@ -176,7 +176,7 @@ class Client:
         """
         from talkcli.client.saying import Saying  # rarely needed, and slow to import
 
-        return Saying(self._calls, text, options)
+        return Saying(self._calls, text, **options)
 
     def stream(
         self,

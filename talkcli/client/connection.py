@@ -138,14 +138,7 @@ class Connection(ClientCore):
                 self._drop()
             self.changed.notify_all()
 
-    def request(self, request: Request, on_reply: OnReply | None = None) -> tuple[JsonObject, list[JsonObject]]:
-        """Send a request, and block until it is answered. Return the reply and the items of its list.
-
-        The arguments and errors are those of `ask`.
-        """
-        return run_blocking(self.ask(request, on_reply))
-
-    async def ask(self, request: Request, on_reply: OnReply | None = None) -> tuple[JsonObject, list[JsonObject]]:
+    async def request(self, request: Request, on_reply: OnReply | None = None) -> tuple[JsonObject, list[JsonObject]]:
         """Send a request, and wait for the answer. Return the reply and the items of its list.
 
         Args:

@@ -109,9 +109,9 @@ class GoalCalls(TrackedGoal):
     async def _cancel(self) -> Goal:
         """Cancel the goal, and wait until it has stopped. Return it."""
         if not self.state.terminal:
-            found = Canceled.from_items((await self._connection.ask(Cancel((self.id,))))[1])
+            found = Canceled.from_items((await self._connection.request(Cancel((self.id,))))[1])
             goal = next((each for each in (*found.canceled, *found.ended) if each.id == self.id), None)
-            goal = goal or Goal.from_json((await self._connection.ask(Status(self.id)))[0].get("goal"))
+            goal = goal or Goal.from_json((await self._connection.request(Status(self.id)))[0].get("goal"))
             with self._connection.changed:
                 self._update(goal)
         return self.goal
@@ -132,7 +132,7 @@ class GoalCalls(TrackedGoal):
             self._update(next(goals(items, "goal")))
             self._listen(feedback=feedback)
 
-        await self._connection.ask(Wait((self.id,), feedback), accepted)
+        await self._connection.request(Wait((self.id,), feedback), accepted)
 
     def _give_up(self, timeout: float | None) -> None:
         """End the goal as LOST if the connection has ended. Otherwise, raise TimeoutError."""

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 class SayingCalls:
     """The base class of context managers that speak a text until their block ends."""
 
-    def __init__(self, client: ClientCalls, text: str, options: dict[str, Any]) -> None:
+    def __init__(self, client: ClientCalls, *text: str, **options: Any) -> None:
         """Prepare to speak a text, without sending anything.
 
-        `options` are the arguments of `Client.say`. The client chooses the id, so that the goal can be cancelled even
-        if the wait for the server's answer is interrupted.
+        The arguments are those of `Client.say`. The client chooses the id, so that the goal can be cancelled even if
+        the wait for the server's answer is interrupted.
         """
         self._client, self._text = client, text
         self._options = {**options, "id": options.get("id") or client._connection.new_goal_id()}
@@ -34,7 +34,7 @@ class SayingCalls:
     async def _begin(self, handle_type: type[_Handle]) -> _Handle:
         """Send the goal. Return its handle."""
         try:
-            self._goal = goal = await self._client._say(handle_type, self._text, **self._options)
+            self._goal = goal = await self._client._say(handle_type, *self._text, **self._options)
         except TalkError:
             raise
         except BaseException:

@@ -73,7 +73,7 @@ class StreamCalls:
                 await self._begin_goal(request)
                 continue
             try:
-                await connection.ask(request, self._add_text)
+                await connection.request(request, self._add_text)
             except RequestRefused as error:
                 if self._process_error(error):
                     raise
@@ -98,7 +98,7 @@ class StreamCalls:
 
         self._goal_id = request.id
         try:
-            await self._connection.ask(request, on_reply)
+            await self._connection.request(request, on_reply)
         except TalkError:
             self._goal_id = None
             raise
@@ -114,7 +114,7 @@ class StreamCalls:
         """Ask the server to stop the goal, because its text will never be complete."""
         if self._goal_id:
             with suppress(TalkError):
-                await self._connection.ask(Append(self._goal_id, broken=True))
+                await self._connection.request(Append(self._goal_id, broken=True))
 
     def _process_error(self, error: TalkError) -> bool:
         """Record that text could not be added. Return whether the goal accepts other text."""

@@ -201,7 +201,7 @@ async def test_a_server_that_does_not_greet_in_time_is_unavailable(
     dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
     with await accepted(listening) as server:
         server.sendall(GREETING[:9])
-        with pytest.raises(ServerUnavailable, match=f"did not answer; check process {os.getpid()}"):
+        with pytest.raises(ServerUnavailable, match=f"doesn't respond; check process {os.getpid()}"):
             await dialing
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import talkcli
-from talkcli import errors
+from talkcli import aio, errors
 from talkcli.cli.commands import COMMANDS
 from tests.conformance.bareserve import TALK, environment, run
 from tests.support.processes import Talk
@@ -147,13 +147,16 @@ def _indented(text: str, mark: str = "  ") -> str:
 
 
 def _library() -> str:
-    """Return the public names of `talkcli` with their members, and the errors."""
-    lines = [f"__all__ = {talkcli.__all__}"]
-    for name in talkcli.__all__:
-        value = getattr(talkcli, name)
-        if isinstance(value, type):
-            lines += ["", f"class {name}", *_members(value)]
-    lines += ["", "errors"]
+    """Return the public names of `talkcli` and `talkcli.aio` with their members, and the errors."""
+    lines = []
+    for package, prefix in ((talkcli, ""), (aio, "aio.")):
+        lines.append(f"{prefix}__all__ = {package.__all__}")
+        for name in package.__all__:
+            value = getattr(package, name)
+            if isinstance(value, type):
+                lines += ["", f"class {prefix}{name}", *_members(value)]
+        lines.append("")
+    lines.append("errors")
     for value in vars(errors).values():
         if isinstance(value, type) and issubclass(value, errors.TalkError):
             (base, *_) = value.__bases__
@@ -175,7 +178,7 @@ def _members(kind: type) -> Iterator[str]:
         if isinstance(member, property):
             yield f"    {name}: {inspect.signature(member.fget).return_annotation}"  # type: ignore[arg-type]
         elif callable(member):
-            yield f"    def {name}{inspect.signature(member)}"
+            yield f"    {'async ' * inspect.iscoroutinefunction(member)}def {name}{inspect.signature(member)}"
 
 
 def _wire() -> str:

@@ -5,21 +5,21 @@ They wrap the client core, run in the event loop, and return lines without decod
 
 from __future__ import annotations
 
-import _socket  # `connect.reach` returns sockets of the type `_socket.socket`
 import asyncio
 import contextlib
-import random
+import socket
 from typing import TYPE_CHECKING
 
-from talkcli import paths, peers
+from talkcli import paths
+from talkcli.aio.connection import wait_ready
 from talkcli.client import connect
-from talkcli.client.core import ClientCore, read_greeting
-from talkcli.errors import AccessDenied, Busy, ServerUnavailable, TalkError
-from talkcli.protocol.lines import MAX_LINE_BYTES, request_line
+from talkcli.client.core import ClientCore
+from talkcli.errors import ServerUnavailable
+from talkcli.protocol.lines import MAX_LINE_BYTES
 
 if TYPE_CHECKING:
+    from talkcli.client.connect import ConnectionAttempt
     from talkcli.client.core import Exchange
-    from talkcli.goals.goal import JsonObject
 
 _CHUNK_BYTES = 64 * 1024
 
@@ -31,41 +31,15 @@ class LocalConnection(ClientCore):
     matters when an operator cancels everything on a thousand robots.
     """
 
-    def __init__(self, socket: _socket.socket, path: str) -> None:
-        """Wrap a non-blocking socket that is already connected to the server at `path`."""
+    def __init__(self, attempt: ConnectionAttempt) -> None:
+        """Wrap the socket of an attempt that has read the server's greeting."""
+        assert attempt.socket
+        assert attempt.server
         self._loop = asyncio.get_running_loop()
         super().__init__(connect.ANSWER_LIMIT_S, self._loop.time())
-        self.path = path
-        self._socket = socket
+        self.path, self.server, self._socket = attempt.path, attempt.server, attempt.socket
         #: received lines that `read` has not returned yet
-        self._lines: list[bytes] = []
-
-    async def greet(self, hello: JsonObject) -> None:
-        """Send a `hello` request, and wait for the server's greeting.
-
-        Close the connection if this fails.
-
-        Raises:
-            ServerUnavailable, AccessDenied, ProtocolMismatch, Busy: the server can't be used.
-        """
-        self.connecting(request_line(hello))
-        self._flush()
-        listener, _ = peers.credentials(self._socket)
-        limit = self._loop.call_later(connect.ANSWER_LIMIT_S, self.abort)
-        try:
-            first, *self._lines = await self.read() or [b""]
-            if not first and self._loop.time() >= limit.when():
-                hint = f"check process {listener}, and restart it if it hangs"
-                raise ServerUnavailable(f"the server at {self.path} did not answer; {hint}")
-            if not first:
-                raise ServerUnavailable(f"the server at {self.path} closed the connection without an answer")
-            server = read_greeting(first, self.path)
-        except BaseException:
-            self.close()
-            raise
-        finally:
-            limit.cancel()
-        self.connected(server, self._loop.time())
+        self._lines = self.split(attempt.received, self._loop.time())
 
     async def read(self) -> list[bytes]:
         """Wait for lines from the server. Return an empty list if the connection has ended.
@@ -113,7 +87,7 @@ class LocalConnection(ClientCore):
         The reader must then call `close`.
         """
         with contextlib.suppress(OSError):
-            self._socket.shutdown(_socket.SHUT_RDWR)
+            self._socket.shutdown(socket.SHUT_RDWR)
 
     def _flush(self) -> None:
         """Send as much queued data as possible without blocking.
@@ -136,37 +110,20 @@ class LocalConnection(ClientCore):
             self._loop.remove_writer(self._socket)
 
 
-async def dial(socket: str | None, name: str, *, urgent: bool = False) -> LocalConnection:
+async def dial(path: str | None, name: str, *, urgent: bool = False) -> LocalConnection:
     """Connect to the server, and wait for its greeting. Return the connection.
 
     Keep trying while the server is busy.
 
     Args:
-        socket: path of the server's socket, or None for the default locations.
+        path: path of the server's socket, or None for the default locations.
         name: the client's name.
         urgent: whether the client sends only `status` and `cancel`. The server reserves connections for such clients.
 
     Raises:
         ServerUnavailable, AccessDenied, ProtocolMismatch, Busy: no usable server was found.
     """
-    place, hello, loop = paths.named_socket(socket), connect.hello(name, urgent=urgent), asyncio.get_running_loop()
-    give_up = loop.time() + connect.ANSWER_LIMIT_S
-    failures: tuple[tuple[str, Exception], ...] = ()
-    while True:
-        attempt = connect.reach(place, failures)
-        failures = ()
-        if attempt.socket:
-            connection = LocalConnection(attempt.socket, attempt.path)
-            try:
-                await connection.greet(hello)
-                return connection
-            except AccessDenied as denied:  # try the next location
-                failures = (*attempt.failures, (attempt.path, denied))
-                continue
-            except Busy as busy:
-                error: TalkError = busy
-        else:
-            error = connect.unreachable_error(attempt, place)
-        if not (attempt.backlog_full or isinstance(error, Busy)) or loop.time() > give_up:
-            raise error
-        await asyncio.sleep(random.uniform(*connect.RETRY_PAUSE_S))
+    message = connect.hello(name, urgent=urgent)
+    return LocalConnection(
+        await connect.connect(paths.named_socket(path), message, connect.ANSWER_LIMIT_S, wait=wait_ready)
+    )

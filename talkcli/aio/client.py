@@ -1,0 +1,191 @@
+"""The client for asyncio, and the handles of its goals.
+
+    async with Client(name="patrol") as talk:
+        goal = await talk.say("battery low")
+        ...
+        if (await goal.wait(timeout=10)).state is not State.SUCCEEDED:
+            print(goal.goal.message)
+
+The calls have the names, parameters and errors of the blocking client, whose documentation has the details. The client
+starts no thread. If a task is cancelled while it waits, nothing is cancelled on the robot.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from inspect import signature
+from typing import TYPE_CHECKING
+
+from talkcli.aio.connection import connect_socket
+from talkcli.client import client as blocking
+from talkcli.client.calls import ClientCalls
+from talkcli.client.connect import ANSWER_LIMIT_S
+from talkcli.client.connection import event_reader
+from talkcli.client.goal import GoalCalls, end_time
+from talkcli.client.saying import SayingCalls
+from talkcli.client.stream import StreamCalls
+from talkcli.errors import UsageError
+from talkcli.protocol.events import Result, WordHeard
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+    from typing import Any
+
+    from talkcli.aio.connection import LoopConnection
+    from talkcli.client.calls import with_parameters_of
+    from talkcli.goals.goal import Goal
+    from talkcli.protocol.events import Event
+else:
+
+    def with_parameters_of(model: Callable) -> Callable:
+        """Return a decorator that makes `help` show the parameters of `model` for a method."""
+
+        def decorate(method: Callable) -> Callable:
+            shown = signature(method).return_annotation
+            method.__signature__ = signature(model).replace(return_annotation=shown)
+            return method
+
+        return decorate
+
+
+class GoalHandle(GoalCalls):
+    """A handle for following and cancelling a goal.
+
+    The state is up to date even if no task waits. Events are buffered until they are read. If there are more than 5,000
+    words and pauses, the oldest are dropped. `events`, `feedback` and `poll` read from the same buffer, so each event
+    is returned only once. A new loop continues where an interrupted one stopped.
+    """
+
+    async def wait(self, timeout: float | None = None) -> Goal:
+        """Wait until the goal has ended, and return it. Raise TimeoutError if `timeout` expires first."""
+        return await self._wait(timeout)
+
+    def events(self, timeout: float | None = None) -> AsyncIterator[Event]:
+        """Iterate over the goal's events as they happen. The last event is the Result."""
+        return self._iterate_events(end_time(timeout), timeout)
+
+    def feedback(self, timeout: float | None = None) -> AsyncIterator[WordHeard]:
+        """Iterate over the goal's words as they are heard, until the goal has ended."""
+        found = self._iterate_events(end_time(timeout), timeout, feedback=True)
+        return (each async for each in found if isinstance(each, WordHeard))
+
+    async def cancel(self) -> Goal:
+        """Cancel the goal, and wait until it has stopped. Return it."""
+        return await self._cancel()
+
+    async def _iterate_events(
+        self, end: float | None, timeout: float | None, *, feedback: bool = False
+    ) -> AsyncIterator[Event]:
+        """Yield the goal's events up to the Result. Raise TimeoutError if `end` (monotonic) passes first."""
+        await self._follow(feedback=feedback)
+        read, event = event_reader(self._connection, self._take, end), None
+        while not isinstance(event, Result):
+            event = await self._read_event(read, timeout)
+            yield event
+
+
+class SpeechStream(StreamCalls):
+    """A text that is spoken while it is written.
+
+    `Client.stream` creates the stream, which is a context manager. When the block ends, the text is complete. If an
+    exception ends the block, the goal is ABORTED at once with the reason `broken_off`, or RECALLED if it hasn't
+    started. Only one task at a time may write.
+    """
+
+    goal: GoalHandle | None
+    _handle_type = GoalHandle
+
+    async def write(self, text: str) -> bool:
+        """Add text at the end. Return whether the goal accepts more.
+
+        If more than 10,000 characters have not been heard, the call waits until more of them have been heard.
+        """
+        return await self._write(text)
+
+    async def wait(self, timeout: float | None = None) -> Goal | None:
+        """Wait until the goal has ended, and return it. Return None if there is no goal."""
+        return await self.goal.wait(timeout) if self.goal else None
+
+    async def __aenter__(self) -> SpeechStream:
+        return self
+
+    async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        await self._finish(failed=kind is not None)
+
+
+class Saying(SayingCalls):
+    """A text that is spoken until an `async with` block ends. `Client.saying` creates it."""
+
+    async def __aenter__(self) -> GoalHandle:
+        return await self._begin(GoalHandle)
+
+    async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        await self._end(failed=kind is not None)
+
+
+class Client(ClientCalls):
+    """A client for asyncio, which connects at the beginning of an `async with` block, or with `connect`.
+
+    Use it in the event loop in which it was connected. It reconnects like the blocking client.
+    """
+
+    def __init__(self, socket: str | None = None, *, name: str | None = None, timeout: float = ANSWER_LIMIT_S) -> None:
+        """Create a client, without connecting it. The arguments are those of the blocking client."""
+        self._open: Callable[[], Awaitable[LoopConnection]] = partial(connect_socket, socket, name, timeout)
+
+    async def connect(self) -> Client:
+        """Connect to the server, unless the client is connected. Return the client.
+
+        The errors are those of the blocking client's constructor.
+        """
+        if "_connection" not in vars(self) or self._connection.ended is not None:
+            super().__init__(await self._open())
+        return self
+
+    async def close(self) -> None:
+        """Close the connection. Goals that were sent are still spoken."""
+        self._connection.close()
+
+    async def __aenter__(self) -> Client:
+        return await self.connect()
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    @with_parameters_of(blocking.Client.say)
+    async def say(self, *text: str, **options: Any) -> GoalHandle:
+        """Send a text to be spoken. Return the handle of its goal.
+
+        If the task is cancelled during this call, the text may be spoken nevertheless. To end it then, too, use
+        `saying`, or choose the `key` or the `id`.
+        """
+        return await self._say(GoalHandle, *text, **options)
+
+    @with_parameters_of(blocking.Client.say)
+    def saying(self, *text: str, **options: Any) -> Saying:
+        """Return an asynchronous context manager that speaks a text until its block ends.
+
+        It cancels the goal even if the task is cancelled.
+        """
+        return Saying(self, *text, **options)
+
+    @with_parameters_of(blocking.Client.stream)
+    def stream(self, **options: Any) -> SpeechStream:
+        """Return a stream that speaks a text while the text is being written."""
+        return SpeechStream(self._connection, self._stream_request(**options))
+
+    async def follow(self, ids: Iterable[str] | None = None, *, feedback: bool = False) -> list[GoalHandle]:
+        """Subscribe to the events of goals. Return the goals' handles."""
+        return await self._follow(GoalHandle, ids, feedback=feedback)
+
+    async def events(self, *, reconnect: bool = False) -> AsyncIterator[Event]:
+        """Iterate over the events of all goals, from the first step of the iteration on."""
+        next_event = await self._watch(reconnect=reconnect)
+        while True:
+            yield await next_event()
+
+    def __getattr__(self, name: str) -> Any:
+        """Explain that a client is not connected, if its connection is missing."""
+        if name == "_connection":
+            raise UsageError("this client is not connected; use it as in: async with Client() as talk")
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")

@@ -1,0 +1,123 @@
+"""The asyncio library and the blocking library have the same names, parameters, defaults and errors."""
+
+from __future__ import annotations
+
+import inspect
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import talkcli
+from talkcli import aio
+from talkcli.errors import BadOption, ServerUnavailable, UnknownGoal, UsageError
+from tests.support.loop import in_loop
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+    from tests.support.processes import Talk
+
+#: For each class, its public names by what the asyncio library makes of the blocking library's method. An awaited
+#: method is a coroutine function. An iterated method returns an asynchronous iterator, and an entered one returns an
+#: asynchronous context manager. The same method never waits.
+TABLE = {
+    "Client": {
+        "awaited": "say follow cancel status goal log voices settings set pause resume close",
+        "iterated": "events",
+        "entered": "stream saying",
+        "same": "path server_pid",
+        "only asyncio": "connect",
+        "only blocking": "over",
+    },
+    "GoalHandle": {"awaited": "wait cancel", "iterated": "events feedback", "same": "id state poll request_cancel"},
+    "SpeechStream": {"awaited": "write wait", "same": "goal"},
+}
+ROWS = [
+    (name, kind, method) for name, kinds in TABLE.items() for kind, some in kinds.items() for method in some.split()
+]
+#: Calls that fail in both libraries: the method, its arguments, and the error.
+ERRORS: list[tuple[str, dict[str, Any], type[Exception], str]] = [
+    ("say", {"text": "a", "rate": 9}, UsageError, "the rate must be"),
+    ("say", {"text": "a", "key": ""}, UsageError, "key"),
+    ("say", {"text": "a", "loud": True}, TypeError, "loud"),
+    ("say", {}, TypeError, "text"),
+    ("stream", {"stall": 0}, UsageError, "the stall must be"),
+    ("stream", {"throttle": 5}, UsageError, "by its key"),
+    ("follow", {"ids": [""]}, UsageError, "empty"),
+    ("follow", {"ids": ["nobody"]}, UnknownGoal, "nobody"),
+    ("cancel", {"ids": ["nobody"]}, UnknownGoal, "nobody"),
+    ("cancel", {"key": ""}, UsageError, "key"),
+    ("goal", {"goal_id": "12"}, UnknownGoal, "-12"),
+    ("log", {"count": 0}, UsageError, "the count must be"),
+    ("set", {"rate": 9}, UsageError, "the rate must be"),
+    ("set", {"voice": "parrot"}, BadOption, "parrot"),
+]
+#: Arguments of `Client` that are refused.
+REFUSED: list[tuple[dict[str, Any], type[Exception]]] = [
+    ({"timeout": 0}, UsageError),
+    ({"name": "x" * 65}, UsageError),
+    ({"socket": "/nowhere"}, ServerUnavailable),
+]
+
+
+def public(module: ModuleType, name: str) -> set[str]:
+    kind = getattr(module, name)
+    return {each for each in {*dir(kind), *inspect.get_annotations(kind)} if not each.startswith("_")}
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_the_table_has_all_public_names(name: str) -> None:
+    names = {kind: set(some.split()) for kind, some in TABLE[name].items()}
+    alone = {library: names.pop(f"only {library}", set()) for library in ("asyncio", "blocking")}
+    common = set().union(*names.values())
+    assert public(aio, name) == common | alone["asyncio"]
+    assert public(talkcli, name) == common | alone["blocking"]
+    assert name in aio.__all__
+
+
+@pytest.mark.parametrize(("name", "kind", "method"), [row for row in ROWS if not row[1].startswith("only")])
+def test_a_method_has_the_parameters_and_defaults_of_the_blocking_one(name: str, kind: str, method: str) -> None:
+    blocking, own = (inspect.getattr_static(getattr(each, name), method, None) for each in (talkcli, aio))
+    assert inspect.iscoroutinefunction(own) == (kind == "awaited")
+    if kind == "same" and name == "Client":
+        blocking, own = blocking.fget, own.fget
+    if callable(own):
+        # The blocking method gets its parameters from `say` by a decorator for type checkers.
+        model = talkcli.Client.say if method == "saying" else blocking
+        assert inspect.signature(own).parameters == inspect.signature(model).parameters
+
+
+def test_the_constructors_have_the_same_parameters() -> None:
+    assert inspect.signature(aio.Client) == inspect.signature(talkcli.Client)
+
+
+@pytest.mark.parametrize(("method", "arguments", "error", "words"), ERRORS)
+@in_loop
+async def test_a_call_fails_with_the_error_of_the_blocking_one(
+    scripted: Talk, method: str, arguments: dict[str, Any], error: type[Exception], words: str
+) -> None:
+    with talkcli.Client(scripted.socket) as talk, pytest.raises(error, match=words) as blocking:
+        getattr(talk, method)(**arguments)
+
+    async def call(own: aio.Client) -> None:
+        result = getattr(own, method)(**arguments)
+        if inspect.isawaitable(result):
+            await result
+
+    async with aio.Client(scripted.socket) as own:
+        with pytest.raises(error, match=words) as caught:
+            await call(own)
+    if error is not TypeError:
+        assert repr(caught.value) == repr(blocking.value)
+
+
+@pytest.mark.parametrize(("arguments", "error"), REFUSED)
+@in_loop
+async def test_a_client_is_refused_with_the_error_of_the_blocking_one(
+    arguments: dict[str, Any], error: type[Exception]
+) -> None:
+    with pytest.raises(error) as blocking:
+        talkcli.Client(**arguments)
+    with pytest.raises(error) as caught:
+        await aio.Client(**arguments).connect()
+    assert repr(caught.value) == repr(blocking.value)
