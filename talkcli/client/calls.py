@@ -77,7 +77,7 @@ class ClientCalls:
         before: str | None = None,
         key: str | None = None,
     ) -> Canceled:
-        """Cancel goals, and wait until they have stopped. Return the result."""
+        """Cancel goals, and wait until they have stopped. Return the cancelled and the already ended goals."""
         wanted = None if ids is None else [self._full_id(each) for each in ids]
         first, *others = [None] if wanted is None else batches(wanted) or [()]
         last = None if before is None else self._full_id(before)
@@ -176,7 +176,7 @@ class ClientCalls:
         id: str | None = None,  # noqa: A002 - the option has this name everywhere
         **options: Any,
     ) -> Say:
-        """Check the options of a stream. Return the request for its goal, without a text."""
+        """Check the options of a stream. Return its `say` request, which has no text yet."""
         say = Say("", id=id, wait=True, more=True, **options)
         check(say)
         if error := self._connection.unsupported(say):

@@ -249,7 +249,7 @@ class Client:
         before: str | None = None,
         key: str | None = None,
     ) -> Canceled:
-        """Cancel goals, and wait until they have stopped. Return the result.
+        """Cancel goals, and wait until they have stopped. Return the cancelled and the already ended goals.
 
         Without arguments, cancel all goals. A goal is cancelled if any of the arguments selects it.
 

@@ -108,7 +108,7 @@ def _check_owner(connected: _socket.socket) -> None:
 def send_early(
     attempt: ConnectionAttempt, hello: JsonObject, request: JsonObject, before_request: Callable[[], None]
 ) -> ConnectionAttempt | None:
-    """Send the hello message, and try to send the first request early. Return the attempt.
+    """Send the hello message. If the greeting comes at once, send the first request. Return the attempt.
 
     The request is not sent if the greeting is late or unexpected, or if the server may lack a feature.
 

@@ -51,7 +51,7 @@ def checked_sender_name(name: str | None) -> str | None:
 def event_reader(
     connection: Connection, take: Callable[[], _T], deadline: float | None
 ) -> Callable[[], Coroutine[Any, Any, _T]]:
-    """Return a coroutine function that returns the next result of `take`, and waits for the server if there is none.
+    """Return a coroutine function that waits for messages until `take` returns a result, and returns it.
 
     Its result is false if `deadline` has passed or the connection has ended. Nothing more is received after `deadline`,
     so that a loop over the results ends even if the server keeps sending events.
@@ -164,7 +164,7 @@ class Connection(ClientCore):
         return self.answer(exchange)
 
     def _stop_waiting(self, exchange: Exchange) -> None:
-        """Drop an exchange, whether or not it has been answered."""
+        """Drop an exchange. If only part of its request was sent, break off the connection."""
         if not self.forget(exchange):
             self._cut_off()
 
@@ -210,7 +210,7 @@ class Connection(ClientCore):
             self.begin(request, on_reply, on_failure)
 
     async def until(self, done: Callable[[], bool], deadline: float | None, *, interruptible: bool = True) -> bool:
-        """Wait as `wait_until` does. Coroutines call this method.
+        """Do the same as `wait_until`, for a coroutine.
 
         A connection that runs in an event loop suspends the coroutine. Other connections block.
         """
@@ -224,7 +224,7 @@ class Connection(ClientCore):
         since: float | None = None,
         interruptible: bool = True,
     ) -> bool:
-        """Process messages until `done()` is true. Return False if the deadline passes first.
+        """Process messages until `done()` is true. Return False at the deadline or the connection's end.
 
         If the server is silent for too long, the connection ends.
 
@@ -507,7 +507,7 @@ class ReconnectingConnection(SocketConnection):
         return super().begin(request, on_reply, on_failure)
 
     def break_off(self, why: str, now: float) -> None:
-        """Disconnect, and schedule an attempt to reconnect.
+        """Disconnect, fail unanswered requests, and schedule an attempt to reconnect.
 
         Do nothing if the connection has ended for good.
         """
@@ -549,7 +549,7 @@ class ReconnectingConnection(SocketConnection):
             self._schedule_retry(error, now)
 
     def _connect_again(self, now: float, *, at_once: bool = False) -> None:
-        """Reconnect if the pause between attempts is over.
+        """Open a new connection if there is none and the pause between attempts is over.
 
         `at_once` ignores the pause.
         """
@@ -564,7 +564,7 @@ class ReconnectingConnection(SocketConnection):
         self._flush()
 
     def _schedule_retry(self, error: TalkError, now: float) -> None:
-        """Record a failed attempt to connect, fail waiting requests, and schedule a retry."""
+        """Record a failed attempt to connect, fail the requests that callers await, and schedule a retry."""
         self._due = now + _RECONNECT_PAUSE_S
         self.not_connected(error)
 

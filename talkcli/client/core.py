@@ -308,7 +308,7 @@ class ServerInfo:
 
 
 def read_greeting(line: bytes, path: str) -> ServerInfo:
-    """Read a server's greeting. Raise an error if the server can't be used.
+    """Return the server's description from its greeting. Raise an error if the server can't be used.
 
     Raises:
         ServerUnavailable: the line is not a greeting.
@@ -434,7 +434,7 @@ class ClientCore:
         return request_line({"seq": exchange.number, **request_to_json(exchange.request)})
 
     def queue(self, line: bytes, exchange: Exchange) -> None:
-        """Queue the line with an exchange's request for sending.
+        """Queue the line of an exchange's request for sending.
 
         Raises:
             ServerUnavailable: nothing more can be sent.
@@ -593,7 +593,7 @@ class ClientCore:
         return min(times, default=float("inf"))
 
     def expire(self, now: float) -> bool:
-        """Fail late requests, and give up lost goals. Return False if the connection must be closed.
+        """Fail late requests, and end lost goals as LOST. Return False if the connection must be closed.
 
         Followed goals are LOST if the client was disconnected for too long.
 
@@ -736,7 +736,7 @@ class ClientCore:
             self.fail(exchange, error)
 
     def connected(self, server: ServerInfo, now: float) -> None:
-        """Record the greeting after reconnecting. Follow all goals again, or end them as LOST.
+        """After reconnecting, follow the goals again, or end them as LOST. Queue the waiting requests.
 
         The goals are LOST if the server was restarted in the meantime. Otherwise, they are followed again, and their
         texts continue over this connection. Watches and waiting requests are sent again.
@@ -803,7 +803,7 @@ class ClientCore:
         self.queue(self.line(exchange), exchange)
 
     def fail(self, exchange: Exchange, error: TalkError) -> None:
-        """End an exchange with an error, unless it has already ended."""
+        """End an exchange with an error, and call its `on_failure`, unless it has already ended."""
         if exchange.over:
             return
         exchange.error = error

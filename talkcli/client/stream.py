@@ -52,13 +52,13 @@ class StreamCalls:
         return self._refused or (self.goal is not None and self.goal.state.terminal)
 
     async def _write(self, text: str) -> bool:
-        """Add text at the end. Return whether the goal accepts more."""
+        """Add text at the end, and send it. Return whether the goal accepts more."""
         if not self._stopped:
             self._text.write(text)
         return await self._send()
 
     async def _finish(self, *, failed: bool) -> None:
-        """Complete the text, or stop the goal if the program that writes the text has failed."""
+        """Send the rest of the text, or stop the goal if the program that writes the text has failed."""
         if failed and not self._stopped:
             await self._break_off()
         elif self.goal and not failed:
@@ -145,7 +145,7 @@ class SpeechStream(StreamCalls):
     _handle_type = GoalHandle
 
     def write(self, text: str) -> bool:
-        """Add text at the end. Return whether the goal accepts more.
+        """Add text at the end, and send it. Return whether the goal accepts more.
 
         Text is sent at once, except blanks at the very beginning. If more than 10,000 characters have not been heard,
         the call waits until more of them have been heard.
