@@ -1,4 +1,4 @@
-"""Paths of the socket, the neural voices and the cache.
+"""Paths of the socket, the neural voices, the cache and the history.
 
 A server takes the socket path that platformdirs gives, which also checks the owner and mode of the directory. Importing
 platformdirs would double the time that a client takes to start, so a client tries a fixed list of paths. A test
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 SOCKET_NAME = "talk.sock"
 #: Socket of the system-wide server. systemd creates the directory if the unit has `RuntimeDirectory=talk`.
 SYSTEM_SOCKET = f"/run/talk/{SOCKET_NAME}"
+#: State directory of the system-wide server. systemd creates it if the unit has `StateDirectory=talk`.
+_SYSTEM_STATE_DIRECTORY = "/var/lib/talk"
 
 #: Descriptions of paths to which no client can connect.
 PLACE_ABSENT = "not found"
@@ -169,6 +171,32 @@ def cache_directory() -> str:
     if given:
         return os.path.realpath(given.split(":")[0])  # this is a symbolic link if the unit sets DynamicUser=
     return os.path.join(_user_directory(os.environ.get("XDG_CACHE_HOME"), "~/.cache"), "talk")
+
+
+def history_file(socket: str) -> str:
+    """Return the path of the history of the server with this socket. The directory may not exist yet."""
+    given = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+    return os.path.join(given or _state_directory(), _history_name(socket))
+
+
+def history_files(named: str | None) -> list[str]:
+    """Return the paths where the servers that a client tries may have their histories.
+
+    If `named` is given, it is the path of the only server's socket.
+    """
+    names = map(_history_name, client_sockets(named))
+    return [os.path.join(each, name) for name in names for each in (_state_directory(), _SYSTEM_STATE_DIRECTORY)]
+
+
+def _history_name(socket: str) -> str:
+    """Return the file name of a history. Each socket has another one."""
+    path = os.path.realpath(socket).lstrip("/")
+    return f"{path.replace('%', '%25').replace('-', '%2d').replace('/', '-')}.db"
+
+
+def _state_directory() -> str:
+    """Return the path of the user's state directory, which may not exist yet."""
+    return os.path.join(_user_directory(os.environ.get("XDG_STATE_HOME"), "~/.local/state"), "talk")
 
 
 def _user_directory(named: str | None, default: str) -> str:

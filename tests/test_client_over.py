@@ -14,10 +14,10 @@ from talkcli.client.core import ServerInfo
 from talkcli.client.goal import GoalHandle, merged
 from talkcli.errors import Lost, ServerUnavailable
 from talkcli.goals.goal import Goal
-from talkcli.goals.options import Cancel, Say
+from talkcli.goals.options import Cancel, Log, Say
 from talkcli.protocol.events import PausedChanged, Result, StateChanged, from_json
 from talkcli.protocol.lines import encode
-from talkcli.protocol.requests import Log, Status, Wait, Watch
+from talkcli.protocol.requests import Status, Wait, Watch
 from tests.support.connection import PATIENCE
 from tests.support.scripted_peer import goal, result
 

@@ -1,6 +1,6 @@
 """The commands that send a request to the server and show its answer.
 
-They are cancel, status, watch, log, voices, set, pause and resume. `talk doctor` is also here.
+They are cancel, status, watch, voices, set, pause and resume. `talk doctor` is also here.
 
 This module must not import click, because simple command lines are run without it. Modules that only one command needs
 are imported by that command.
@@ -77,16 +77,6 @@ def watch(options: CommonOptions, words: bool, long: bool) -> int:
         for event in client.events():
             show_result(options, [event.to_json()], partial(transcript.lines, event, screen(long=long), time.time()))
     return interrupts.exit_code
-
-
-def log(options: CommonOptions, count: int, long: bool) -> None:
-    """Show the goals that have ended most recently."""
-    from talkcli.terminal.transcript import log_lines
-
-    with options.connect() as client:
-        goals = client.log(count)
-        output = screen(long=long, boot=client._connection.boot)
-    show_result(options, (each.to_json() for each in goals), lambda: log_lines(goals, output, time.time()))
 
 
 def voices(options: CommonOptions, language: str | None) -> None:

@@ -89,11 +89,13 @@ def _make_click_option(option: Option, *, common: bool = False) -> click.Option:
     The value of a common option is stored in CommonOptions.
     """
     flag = not option.takes_argument
+    value = option.flag_value or option.bare_value
+    flag_value: dict[str, Any] = {"flag_value": value} if value else {}
     return click.Option(
         [*option.flags.split(", "), option.name],
         type=None if flag else _click_type(option),
-        is_flag=flag or None,
-        **({"flag_value": option.flag_value} if option.flag_value else {}),
+        is_flag=flag if option.bare_value is None else False,
+        **flag_value,
         default=option.default,
         show_default=not flag and option.default is not None,
         metavar=None if flag else option.metavar or option.kind.metavar or option.name.upper(),
@@ -109,7 +111,7 @@ def _make_click_option(option: Option, *, common: bool = False) -> click.Option:
 def _click_type(option: Option) -> Any:
     """Return the click type that checks and converts the values of an option."""
     if option.choices:
-        return click.Choice(option.choices)
+        return click.Choice(option.choices, case_sensitive=False)
     return click.Path(dir_okay=False) if option.kind is OUTPUT_FILE else _OptionType(option)
 
 

@@ -9,7 +9,7 @@ This module also parses option values, and texts that may contain invalid UTF-8.
 from __future__ import annotations
 
 from talkcli.frozen import TYPE_CHECKING, frozen
-from talkcli.goals.options import FLAG, ID, PATH, SECONDS, WORD, Kind, Option
+from talkcli.goals.options import FLAG, ID, MOMENT, PATH, SECONDS, WORD, Kind, Option
 from talkcli.paths import named_robot
 
 if TYPE_CHECKING:
@@ -38,6 +38,8 @@ _NOT_A_TIME = {
     "ms": "must be a time in whole milliseconds, such as 300ms or 0.3s",
 }
 
+#: The words for a day, with the number of days before today.
+_DAYS_AGO = {"today": 0, "yesterday": 1}
 #: Options that can't be used with several robots.
 _SINGLE_ROBOT_OPTIONS = ("lines", "ahead", "stream", "feedback", "output")
 
@@ -207,6 +209,8 @@ def read_value(option: Option, text: str) -> Any:
     The error message says why.
     """
     kind = option.kind
+    if kind is MOMENT:
+        return _parse_moment(text)
     if int in kind.types:
         return _parse_number(option, text)
     if kind is FILE_MODE:
@@ -247,6 +251,30 @@ def _parse_duration(text: str, unit: str) -> float:
     """Convert a duration such as 2m to this unit. Raise LookupError or ValueError if it is malformed."""
     number = text.rstrip("hms")
     return round(float(number) * _TIME_UNITS_MS[text[len(number) :]] / _TIME_UNITS_MS[unit], 6)
+
+
+def _parse_moment(text: str) -> float:
+    """Convert a time of day, a day, both, or a time before now to seconds since 1970. Times are local.
+
+    Raises:
+        ValueError: the text is malformed.
+    """
+    from datetime import datetime, timedelta  # rarely needed, and slow to import
+
+    now = datetime.now()
+    words = text.split(" ")
+    try:
+        if text.endswith(("h", "m", "s")):
+            return (now - timedelta(seconds=_parse_duration(text, "s"))).timestamp()
+        clock = words.pop() if ":" in words[-1] else "00:00"
+        day, *rest = words or ["today"]
+        date = now - timedelta(_DAYS_AGO[day]) if day in _DAYS_AGO else datetime.strptime(day, "%Y-%m-%d")
+        form = "%H:%M:%S" if clock.count(":") > 1 else "%H:%M"
+        if not rest:
+            return datetime.combine(date, datetime.strptime(clock, form).time()).timestamp()
+    except (LookupError, OverflowError, ValueError):
+        pass
+    raise ValueError(f"must be a time such as 2h, 14:00, yesterday or '2026-11-24 14:00', got '{text}'")
 
 
 def _parse_file_mode(text: str) -> int:

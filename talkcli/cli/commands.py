@@ -7,6 +7,7 @@ and servers are in `goals.options`. The functions here check combinations of opt
 from __future__ import annotations
 
 import os
+import time
 
 from talkcli.cli.command import FILE_MODE, OUTPUT_FILE, TIME_LIMIT, Command, long_flag, option
 from talkcli.frozen import TYPE_CHECKING, replace
@@ -19,7 +20,10 @@ from talkcli.goals.options import (
     MAX_LOG_GOALS,
     MAX_TEXT_CHARS,
     MILLISECONDS,
+    NO_TEXT_HISTORY,
+    PATH,
     TEXT,
+    TEXT_HISTORY,
     WORD,
     Option,
 )
@@ -158,6 +162,14 @@ _SERVE_OPTIONS = (
         metavar="MB",
     ),
     option("--driver", TEXT, "Use this pyttsx3 driver. [default: the driver for this system]", metavar="NAME"),
+    option(
+        "--history",
+        PATH,
+        "Store all ended goals on disk for 90 days, for 'talk log'. With no-text, the texts are left out. The history "
+        "is in the state directory, or in FILE, whose path contains '/'.",
+        metavar="[no-text|FILE]",
+        bare_value=TEXT_HISTORY,
+    ),
     option("--socket-mode", FILE_MODE, "Set the socket's file mode, which decides who may connect.", default="0600"),
     option("--greeting", TEXT, "Speak this sentence when the server starts."),
     _print_unit_option("user", "system", "user-socket", "system-socket"),
@@ -169,6 +181,9 @@ def _serve_fault(values: Mapping[str, Any], _: frozenset[str]) -> str | None:
     player = values["player"] or ""
     if values["device"] and player.startswith(("null", "file:")):
         return f"the player {player} has no devices; leave out --device"
+    history = values["history"]
+    if history and "/" not in history and history not in {TEXT_HISTORY, NO_TEXT_HISTORY}:
+        return f"--history takes no-text or a path with a '/', such as ./{history}.db (got '{history}')"
     if player == "file:":
         return "--player file: needs a path, as in file:PATH.wav"
     return None
@@ -179,6 +194,14 @@ def _bridge_fault(values: Mapping[str, Any], _: frozenset[str]) -> str | None:
     if values["name"] is None and not values["print_acl"]:
         return "--name is missing; choose the robot's name on the broker, as in: talk bridge --name anna"
     return None
+
+
+def _log_fault(values: Mapping[str, Any], _: frozenset[str]) -> str | None:
+    """Return an error message if `log` could show no goal because of its times."""
+    since, until = values["since"] or 0.0, values["until"]
+    if since > time.time():
+        return "--since is in the future; for a time on the day before, write: --since 'yesterday 14:00'"
+    return "--since must be before --until" if until is not None and since >= until else None
 
 
 _GOAL_IDS = Option("ids", IDS, metavar=IDS.metavar, completion="goal_ids")
@@ -334,21 +357,29 @@ _ROWS = (
     Command(
         name="log",
         summary="Show what was said, by whom, and how it ended.",
+        function="log:log",
         description="""
-        Show the goals that have ended, including rejected goals. The newest goal is last.
+        Show the goals that have ended, including rejected goals. The newest goal is last. A sender is shown by the name
+        that it chose (in quotes), or else by the program that called talk.
 
-        A goal of the running server is shown by its number. A sender is shown by the name that it chose (in quotes),
-        or without a name, by the program that called talk.
+        With 'talk serve --history', goals from before the server's start are included. TIME is 14:00, yesterday,
+        '2026-11-24 14:00', or 2h (ago).
         """,
         examples="""
-        talk log
-        talk log -n 100 | grep patrol
-        talk --json log | jq -r 'select(.state == "ABORTED").message'
+        talk log --since yesterday --until today --as patrol
+        talk --json log --state aborted | jq -r .message
         """,
         options=(
-            option("-n, --count", INTEGER, "Show the last N goals.", default=20, limits=(1, MAX_LOG_GOALS)),
+            option(
+                "-n, --count",
+                INTEGER,
+                f"Show the last N.  [default: 20; filtered: {MAX_LOG_GOALS}]",
+                limits=(1, MAX_LOG_GOALS),
+            ),
             _LONG,
+            *(each for each in goal_options.Log.options if each.flags),
         ),
+        rule=_log_fault,
     ),
     Command(
         name="pause",

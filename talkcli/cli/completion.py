@@ -189,7 +189,7 @@ def goal_ids(options: CommonOptions, incomplete: str) -> Offers:
 def known_ids(options: CommonOptions, incomplete: str) -> Offers:
     """Return the ids of unfinished and recent goals as completions."""
     with options.connect(COMPLETION_TIMEOUT_S) as client:
-        status, ended = client.status(), client.log(_MAX_ENDED_GOALS)
+        status, ended = client.status(), client.log(_MAX_ENDED_GOALS, history=False)
     return _offer_ids([*unfinished(status), *reversed(ended)], status, incomplete)
 
 

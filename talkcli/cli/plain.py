@@ -21,7 +21,7 @@ from talkcli.goals.options import MAX_ID_CHARS, MAX_SENDER_NAME_CHARS, MAX_TEXT_
 from talkcli.paths import named_robot, named_socket
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Mapping
     from typing import Any
 
     from talkcli.cli.command import Command
@@ -54,7 +54,7 @@ def read(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand |
     """Parse a simple command line. Return None if click has to parse it."""
     try:
         return _parse(arguments, environment)
-    except (LookupError, ValueError, StopIteration):  # an option is unknown, or its value is invalid or missing
+    except (LookupError, ValueError):  # an option is unknown, or its value is invalid or missing
         return None
 
 
@@ -63,13 +63,15 @@ def _parse(arguments: list[str], environment: Mapping[str, str]) -> PlainCommand
     command: Command | None = None
     words: list[str] = []
     given: dict[str, Any] = {}
-    flags, rest = _flag_table(COMMON_OPTIONS), iter(arguments)
-    for word in rest:
+    flags, rest = _flag_table(COMMON_OPTIONS), arguments[::-1]
+    while rest:
+        word = rest.pop()
         if command is None and word in COMMANDS:
             command = COMMANDS[word]
             flags |= _flag_table(command.options)
         elif command and word == "--":
-            words += rest
+            words += rest[::-1]
+            break
         elif command and (word[:1] != "-" or word == "-"):
             words.append(word)
         else:
@@ -88,18 +90,20 @@ def _flag_table(options: Iterable[Option]) -> Flags:
     return found
 
 
-def _read_option(flags: Flags, word: str, rest: Iterator[str], given: dict[str, Any]) -> None:
-    """Parse one option, and store its value in `given`. If necessary, take the value from `rest`.
+def _read_option(flags: Flags, word: str, rest: list[str], given: dict[str, Any]) -> None:
+    """Parse one option, and store its value in `given`. If necessary, take the value from the end of `rest`.
 
     Raises:
-        KeyError, ValueError, StopIteration: click has to parse the option.
+        LookupError, ValueError: click has to parse the option.
     """
     name, equals, text = word.partition("=")
     option, value = flags[name]
     if option.kind is OUTPUT_FILE or (equals and not (option.takes_argument and name[:2] == "--")):
         raise ValueError(f"only click can parse the option {word}")
     takes_argument = option.takes_argument
-    given[option.name] = read_value(option, text if equals else next(rest)) if takes_argument else value
+    if not equals and option.bare_value is not None and (not rest or rest[-1][:1] == "-"):
+        takes_argument, value = False, option.bare_value
+    given[option.name] = read_value(option, text if equals else rest.pop()) if takes_argument else value
 
 
 def _build_command(

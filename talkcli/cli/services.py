@@ -39,7 +39,8 @@ _NO_DEVICE = (
 )
 #: The environment files that contain the broker's address and login.
 _BRIDGE_ENVIRONMENTS = {"user": "%h/.config/talk/bridge.env", "system": "/etc/talk/bridge.env"}
-
+#: The settings for the directory of the history in the unit of the system-wide server.
+_STATE_DIRECTORY = "# The history of goals.\nStateDirectory=talk\nStateDirectoryMode=0700\n"
 #: Characters that must not occur in a unit: control characters, line separators and surrogates.
 _UNSAFE_CHARACTERS = "[\0-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]"
 #: Directories that systemd's ProtectHome= setting hides.
@@ -51,12 +52,17 @@ def serve(options: CommonOptions, print_unit: str | None, **given: Any) -> int:
 
     `given` contains all other options, by name.
     """
+    history = given["history"]
+    is_named = "/" in (history or "")
+    if is_named:
+        given["history"] = os.path.abspath(history)
     if print_unit:
         mode, words = given["socket_mode"], []
         if print_unit.startswith("system") and "socket_mode" not in options.typed:
             mode = 0o660
             words.append("--socket-mode=0660")
-        return _print_unit(options, "serve", print_unit, given, words, mode=f"{mode:04o}")
+        state = _STATE_DIRECTORY if history and not is_named else ""
+        return _print_unit(options, "serve", print_unit, given, words, mode=f"{mode:04o}", state=state)
     if not options.quiet:
         _warn_about_sound(given["player"] or "", given["driver"])
     from talkcli.goals.options import SETTINGS, Set
@@ -184,7 +190,7 @@ def _find_program(started_as: str) -> tuple[str, ...]:
 
 def _format_option(option: Option, value: object) -> str:
     """Format an option and its value as one command-line argument."""
-    if value is True:
+    if value is True or value == option.bare_value is not None:
         return long_flag(option)
     return f"{long_flag(option)}={value:04o}" if option.kind is FILE_MODE else f"{long_flag(option)}={value}"
 

@@ -13,11 +13,11 @@ from talkcli.client.core import EventBuffer
 from talkcli.errors import Lost, UnknownGoal, UsageError
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.goal import Goal
-from talkcli.goals.options import MAX_ID_CHARS, MAX_IDS, MAX_LOG_GOALS, Cancel, Say, Set, bad_option, key_error
+from talkcli.goals.options import MAX_ID_CHARS, MAX_IDS, Cancel, Log, Say, Set, bad_option, key_error
 from talkcli.goals.states import State
 from talkcli.protocol.events import Canceled, ServerStatus, Snapshot, goal_in, goals
 from talkcli.protocol.lines import MAX_LINE_BYTES, request_line, request_to_json
-from talkcli.protocol.requests import Log, Pause, Resume, Status, Voices, Wait, Watch
+from talkcli.protocol.requests import Pause, Resume, Status, Voices, Wait, Watch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable
@@ -105,11 +105,25 @@ class ClientCalls:
         reply, _ = await self._connection.request(Status(self._full_id(goal_id)))
         return Goal.from_json(reply.get("goal"))
 
-    async def log(self, count: int = 20) -> list[Goal]:
+    async def log(
+        self,
+        count: int = 20,
+        *,
+        since: float | None = None,
+        until: float | None = None,
+        state: State | None = None,
+        name: str | None = None,
+        key: str | None = None,
+        grep: str | None = None,
+        history: bool = True,
+    ) -> list[Goal]:
         """Return the most recently ended goals, including REJECTED ones, oldest first."""
-        if not 0 < count <= MAX_LOG_GOALS:
-            raise UsageError(f"the count must be 1 to {MAX_LOG_GOALS:,}, got {count}")
-        _, items = await self._connection.request(Log(count))
+        request = Log(count, since, until, state.name if state else None, name, key, grep)
+        check(request)
+        # Older servers have no history, and know no filters.
+        known = "history" in (self._connection.server.features or ())
+        request = replace(request, history=history and (known or request != Log(count)))
+        _, items = await self._connection.request(request)
         return list(goals(items, "goal"))
 
     async def voices(self) -> list[JsonObject]:
@@ -279,7 +293,7 @@ def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
     return [tuple(each) for each in groups]
 
 
-def check(request: Say | Set) -> None:
+def check(request: Say | Set | Log) -> None:
     """Raise UsageError if an option of a request is invalid."""
     for option in request.options:
         try:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from talkcli.client.saying import Saying
     from talkcli.client.stream import SpeechStream
     from talkcli.goals.goal import Goal, JsonObject
+    from talkcli.goals.states import State
     from talkcli.protocol.events import Canceled, Event, ServerStatus
 
 __all__ = ["Client", "GoalHandle"]
@@ -278,16 +279,40 @@ class Client:
         """
         return run_blocking(self._calls.goal(goal_id))
 
-    def log(self, count: int = 20) -> list[Goal]:
+    def log(
+        self,
+        count: int = 20,
+        *,
+        since: float | None = None,
+        until: float | None = None,
+        state: State | None = None,
+        name: str | None = None,
+        key: str | None = None,
+        grep: str | None = None,
+        history: bool = True,
+    ) -> list[Goal]:
         """Return the most recently ended goals, including REJECTED ones, oldest first.
 
+        All filters must match. None matches every goal.
+
         Args:
-            count: the maximum number of goals, 1 to 2,200. The server keeps no more than 2,200.
+            count: the maximum number of goals, 1 to 2,200.
+            since: only goals that ended at this time or later, in seconds since 1970 UTC.
+            until: only goals that ended before this time.
+            state: only goals that ended in this state.
+            name: only goals whose sender has this name.
+            key: only goals with this key.
+            grep: only goals whose text contains this string.
+            history: include the goals in the server's history on disk, if it keeps one. The server remembers at most
+                2,200 other goals, and none from before its start.
 
         Raises:
-            UsageError: the count is out of its range.
+            UsageError: a value is out of its range.
+            ProtocolMismatch: the server is too old for filters.
+            RequestRefused: the history can't be read.
         """
-        return run_blocking(self._calls.log(count))
+        given = {name: value for name, value in locals().items() if name != "self"}
+        return run_blocking(self._calls.log(**given))
 
     def voices(self) -> list[JsonObject]:
         """Return the voices of the server's engine.

@@ -142,7 +142,7 @@ def request_status_and_log(client: Client) -> tuple[JsonObject, list[Goal]]:
     The engine of a server that has just started hasn't reported its player yet.
     """
     end = time.monotonic() + _ENGINE_START_LIMIT_S
-    server, log = client.status().server, client.log(_LOG_GOALS_COUNT)
+    server, log = client.status().server, client.log(_LOG_GOALS_COUNT, history=False)
     while server.get("engine") == "starting" and time.monotonic() < end:
         time.sleep(_ENGINE_POLL_S)  # no event reports when the engine is ready
         server = client.status().server
@@ -241,7 +241,8 @@ def judge_server(server: JsonObject, log: Sequence[Goal], now: float) -> list[Fi
         log: the recently ended goals, oldest first.
         now: the current time in seconds since 1970.
     """
-    return [_judge_state(server), _judge_settings(server), _judge_recent_goals(log, now, server)]
+    history = _judge_history(server.get("history"))
+    return [_judge_state(server), _judge_settings(server), *history, _judge_recent_goals(log, now, server)]
 
 
 def _judge_state(server: JsonObject) -> Finding:
@@ -278,6 +279,21 @@ def _judge_settings(server: JsonObject) -> Finding:
         broken = failure if volume <= 0 else warning
         return broken("settings", words, "talk set --volume 1")
     return ok("settings", words)
+
+
+def _judge_history(history: object) -> list[Finding]:
+    """Check whether the server can write its history. Return the finding, or nothing if there is no history."""
+    if not isinstance(history, dict):
+        return []
+    path, error = history.get("path"), history.get("error")
+    if error is None:
+        texts = "" if history.get("with_text") else " without their texts"
+        replaced = f"; {history['replaced']}" if history.get("replaced") else ""
+        return [ok("history", f"goals are stored{texts} in {path}{replaced}")]
+    words = f"{path} can't be written: {error}; {history.get('unwritten')} goals wait in memory"
+    dropped = f", {history['dropped']} are lost" if history.get("dropped") else ""
+    step = "free some space on its disk, and let the server's user write to the file; the server keeps trying"
+    return [warning("history", words + dropped, step)]
 
 
 def _judge_recent_goals(goals: Sequence[Goal], now: float, server: JsonObject) -> Finding:

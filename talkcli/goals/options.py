@@ -28,8 +28,10 @@ MAX_IDS = 4096
 MAX_SENDER_NAME_CHARS = 64
 #: Maximum size of a goal's `data` as JSON. It is meant for labels, not for storage.
 MAX_DATA_BYTES = 1024
-#: Maximum number of goals in a reply to `log`, equal to the number of ended goals that the server keeps.
+#: Maximum number of goals in a reply to `log`, equal to the number of ended goals that the server keeps in memory.
 MAX_LOG_GOALS = 2_200
+#: Names of the states in which a goal can have ended. A test compares them with `State`, which is slow to import.
+END_STATES = ("SUCCEEDED", "ABORTED", "REJECTED", "RECALLED", "PREEMPTED")
 #: Maximum length of a text, enough for several minutes of speech. A longer text should be split, so that other goals
 #: can be spoken in between.
 MAX_TEXT_CHARS = 10_000
@@ -46,6 +48,8 @@ MAX_PRIORITY = 1_000_000
 MAX_KEY_CHARS = 64
 #: Maximum silence before a sentence. No audio device takes longer to wake up.
 MAX_LEAD_IN_MS = 5000
+#: Values of `talk serve --history` for a history in the state directory, with and without texts.
+TEXT_HISTORY, NO_TEXT_HISTORY = "text", "no-text"
 #: Name that selects the speech driver's default voice.
 DEFAULT_VOICE = "default"
 #: Value of the option `format` for texts in Markdown.
@@ -57,6 +61,8 @@ SPEAKER_MARK = "#"
 #: Unicode categories of characters that are never spoken: separators, control and format characters such as the
 #: zero-width space, and unassigned or private code points.
 _SILENT_CATEGORIES = frozenset({"Zs", "Zl", "Zp", "Cc", "Cf", "Cn", "Co"})
+#: Maximum distance of a point in time from 1970, about 30 million years.
+_MAX_MOMENT_S = 1e15
 _DIGITS = frozenset("0123456789")
 _LETTERS = frozenset("abcdefghijklmnopqrstuvwxyz")
 _ID_CHARACTERS = _DIGITS | _LETTERS | frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZ._:/-")
@@ -137,6 +143,26 @@ def _data_error(value: JsonObject) -> str | None:
         return DATA.wrong_type
 
 
+def _sender_name_error(value: str) -> str | None:
+    """Return an error message if a client's name is empty or too long."""
+    return None if 0 < len(value) <= MAX_SENDER_NAME_CHARS else f"must have 1 to {MAX_SENDER_NAME_CHARS} characters"
+
+
+def _log_count_error(value: int) -> str | None:
+    """Return an error message if the `count` of a `log` request is out of range."""
+    return None if 0 < value <= MAX_LOG_GOALS else f"must be 1 to {MAX_LOG_GOALS:,}"
+
+
+def _moment_error(value: float) -> str | None:
+    """Return an error message if a number is too large for a point in time, or NaN."""
+    return None if abs(value) <= _MAX_MOMENT_S else "must be a time in seconds since 1970"
+
+
+def _end_state_error(value: str) -> str | None:
+    """Return an error message if a goal can't end in the state with this name."""
+    return None if value in END_STATES else f"must be one of {', '.join(END_STATES)}"
+
+
 def format_number(value: object) -> str:
     """Format a value for display, with at most four decimal places."""
     return f"{round(value, 4):.12g}" if isinstance(value, float) else str(value)
@@ -154,6 +180,10 @@ NUMBER = Kind("number", (int, float), "must be a number", "X")
 #: A duration in seconds, which can't be negative.
 SECONDS = Kind("number", (int, float), "must be a number", "TIME", time_unit="s")
 MILLISECONDS = Kind("integer", (int,), "must be an integer", "TIME", time_unit="ms")
+#: A point in time in seconds since 1970 UTC. On the command line, it is written as in "yesterday 14:00".
+MOMENT = Kind("number", (int, float), "must be a number", "TIME", check=_moment_error)
+#: The name of a client, which the client chose itself.
+SENDER_NAME = Kind("string", (str,), "must be a string", "NAME", check=_sender_name_error)
 DATA = Kind("object", (dict,), f"must be an object of at most {MAX_DATA_BYTES} bytes", check=_data_error)
 ID = Kind("id", (str,), "must be a string", "ID", _id_error)
 IDS = Kind("list", (list, tuple), f"must be a list of at most {MAX_IDS} ids", "[ID]...", _ids_error)
@@ -212,6 +242,8 @@ class Option:
     env: str = ""
     #: value that the flag sets, if the option isn't boolean but its flag takes no argument
     flag_value: Any = None
+    #: value if no argument follows the option's flag, which may then be left out
+    bare_value: str | None = None
     #: name of the function in `cli.completion` that completes values
     completion: str = ""
     #: the server setting that provides the default, if there is one
@@ -681,6 +713,73 @@ class Cancel:
         ]
 
 
+@frozen
+class Log:
+    """A request for the most recently ended goals, oldest first.
+
+    A filter that is None matches every goal.
+    """
+
+    kind: ClassVar[str] = "log"
+    meaning: ClassVar[str] = (
+        "List the most recently ended goals, including REJECTED goals, oldest first. Each given field excludes the "
+        "goals that don't match it"
+    )
+    options: ClassVar[tuple[Option, ...]] = (
+        Option(
+            "count",
+            Kind("integer", (int,), "must be an integer", "N", check=_log_count_error),
+            "the maximum number of goals",
+            20,
+            form=f"1 to {MAX_LOG_GOALS:,}",
+        ),
+        Option(
+            "since",
+            MOMENT,
+            "the goals that ended at this time or later, in seconds since 1970 UTC",
+            help="Show goals that ended at TIME or later.",
+        ),
+        Option("until", MOMENT, "the goals that ended before this time", help="Show goals that ended before TIME."),
+        Option(
+            "state",
+            Kind("string", (str,), "must be a string", "STATE", check=_end_state_error),
+            "the goals that ended in this state",
+            form=f"one of {', '.join(f'`{each}`' for each in END_STATES)}",
+            choices=END_STATES,
+            help="Show goals that ended in this state, such as ABORTED.",
+        ),
+        Option(
+            "name",
+            SENDER_NAME,
+            "the goals whose sender has this name",
+            form=f"1 to {MAX_SENDER_NAME_CHARS} characters",
+            special_flags="--as",
+            help="Show goals whose sender chose this name.",
+        ),
+        Option("key", WORD, "the goals with this key", help="Show goals with this key."),
+        Option(
+            "grep",
+            TEXT,
+            "the goals whose text contains these characters",
+            help="Show goals whose text contains TEXT, in the same case.",
+        ),
+        Option(
+            "history",
+            FLAG,
+            "also list the goals in the server's history, if it keeps one; see *The history* below",
+            default=False,
+        ),
+    )
+    count: int = 20
+    since: float | None = None
+    until: float | None = None
+    state: str | None = None
+    name: str | None = None
+    key: str | None = None
+    grep: str | None = None
+    history: bool = False
+
+
 def require_fields(data_class: type, options: Iterable[str]) -> None:
     """Raise TypeError if a class lacks a field for one of these options.
 
@@ -691,14 +790,14 @@ def require_fields(data_class: type, options: Iterable[str]) -> None:
             raise TypeError(f"{data_class.__name__} has no field for the option {name!r}")
 
 
-for _request in (Say, Append, Set, Cancel):
+for _request in (Say, Append, Set, Cancel, Log):
     require_fields(_request, (each.name for each in _request.options))
 
 #: Settings of a server that was started without options.
 DEFAULTS = Set(**{each.name: each.setting.initial for each in SETTINGS if each.setting})
 
 
-def bad_option(request: Say | Set) -> str | None:
+def bad_option(request: Say | Set | Log) -> str | None:
     """Return an error message if a request has a value or combination that is not allowed."""
     if isinstance(request, Say) and request.flush and request.preempt is False:
         return "flush can't be combined with preempt false, because it always interrupts"

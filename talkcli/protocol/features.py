@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 #: remove a feature.
 FEATURES = {
     "append": ("growing texts", "more", True),
+    "history": ("filters of the log", "history", True),
     "markdown": ("Markdown", "format", "markdown"),
 }
 

@@ -1,9 +1,10 @@
 """The requests that a client can send, and how they are read from JSON.
 
 Rules for this file: it only defines the form of requests. The scheduler decides whether a goal is admitted. A request
-is a class with a row for each of its fields. The classes of `say`, `append`, `cancel` and `set` are in `goals.options`.
-Fields may be added, but never renamed or given another meaning. A field without a row is refused and never ignored,
-because a client must know that a server doesn't support it. `meaning` is shown in the protocol's document.
+is a class with a row for each of its fields. The classes of `say`, `append`, `cancel`, `log` and `set` are in
+`goals.options`. Fields may be added, but never renamed or given another meaning. A field without a row is refused and
+never ignored, because a client must know that a server doesn't support it. `meaning` is shown in the protocol's
+document.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ from talkcli.goals.options import (
     ID,
     IDS,
     MAX_IDS,
-    MAX_LOG_GOALS,
     MAX_SENDER_NAME_CHARS,
+    SENDER_NAME,
     Append,
     Cancel,
-    Kind,
+    Log,
     Option,
     Say,
     Set,
@@ -31,20 +32,6 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
 
 
-def _sender_name_error(value: str) -> str | None:
-    """Return an error message if a client's name is empty or too long."""
-    return None if 0 < len(value) <= MAX_SENDER_NAME_CHARS else f"must have 1 to {MAX_SENDER_NAME_CHARS} characters"
-
-
-def _log_count_error(value: int) -> str | None:
-    """Return an error message if the `count` of a `log` request is out of range."""
-    return None if 0 < value <= MAX_LOG_GOALS else f"must be 1 to {MAX_LOG_GOALS:,}"
-
-
-_NAME_TYPE = Kind("string", (str,), "must be a string", check=_sender_name_error)
-_COUNT_TYPE = Kind("integer", (int,), "must be an integer", check=_log_count_error)
-
-
 @frozen
 class Hello:
     """The first request of a client, which contains the client's name."""
@@ -52,7 +39,7 @@ class Hello:
     kind: ClassVar[str] = "hello"
     meaning: ClassVar[str] = "Identify the client. Send this first"
     options: ClassVar[tuple[Option, ...]] = (
-        Option("name", _NAME_TYPE, "the client's name, for the log", form=f"1 to {MAX_SENDER_NAME_CHARS} characters"),
+        Option("name", SENDER_NAME, "the client's name, for the log", form=f"1 to {MAX_SENDER_NAME_CHARS} characters"),
         Option(
             "urgent",
             FLAG,
@@ -109,18 +96,6 @@ class Watch:
     kind: ClassVar[str] = "watch"
     meaning: ClassVar[str] = "Return the current state, and then send the events of all goals"
     options: ClassVar[tuple[Option, ...]] = ()
-
-
-@frozen
-class Log:
-    """A request for the most recently ended goals, oldest first."""
-
-    kind: ClassVar[str] = "log"
-    meaning: ClassVar[str] = "List the most recently ended goals, including REJECTED goals, oldest first"
-    options: ClassVar[tuple[Option, ...]] = (
-        Option("count", _COUNT_TYPE, "the maximum number of goals", 20, form=f"1 to {MAX_LOG_GOALS:,}"),
-    )
-    count: int = 20
 
 
 @frozen

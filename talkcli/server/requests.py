@@ -14,16 +14,17 @@ from itertools import chain
 from typing import TYPE_CHECKING
 
 from talkcli.daemon import log
-from talkcli.errors import RequestRefused, UnknownGoal
+from talkcli.errors import Busy, RequestRefused, UnknownGoal
 from talkcli.frozen import fields, replace
 from talkcli.goals import options
 from talkcli.goals.goal import By, JsonObject
-from talkcli.goals.options import Append, Cancel, Say, Set
+from talkcli.goals.options import MAX_LOG_GOALS, Append, Cancel, Log, Say, Set
 from talkcli.goals.reasons import Reason, Refusal
 from talkcli.goals.states import State
+from talkcli.history.rows import given_filters, matches, row_chars, row_to_json
 from talkcli.protocol.events import Result
 from talkcli.protocol.lines import encode
-from talkcli.protocol.requests import Log, Pause, Request, Resume, Status, Voices, Wait, Watch
+from talkcli.protocol.requests import Pause, Request, Resume, Status, Voices, Wait, Watch
 from talkcli.server.connection import PendingRequest, resume_all
 from talkcli.server.speech import MAX_UNHEARD_CHARS, describe_sender, unheard_chars
 
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.goals.record import Record
+    from talkcli.history.rows import Row
     from talkcli.server.connection import ClientConnection, Steps
     from talkcli.server.speech import Speech
 
@@ -406,7 +408,9 @@ class Requests:
         if request.id is None:
             self._answer_overview(pending)
         else:
-            pending.answer(goal=self._require_goal(request.id).snapshot().to_json())
+            history, known = self._speech.history, self._scheduler.find(request.id)
+            rows = await history.search(pending, {"id": request.id}, 1) if history and not known else []
+            pending.answer(goal=row_to_json(rows[0]) if rows else self._require_goal(request.id).snapshot().to_json())
 
     async def _watch(self, pending: PendingRequest, _: Watch) -> None:
         """Reply with the state of the server, and subscribe the client to all events."""
@@ -434,9 +438,37 @@ class Requests:
         pending.answer(({"voice": fields(each)} for each in voices), count=len(voices))
 
     async def _log(self, pending: PendingRequest, request: Log) -> None:
-        """Reply with the most recently ended goals."""
-        records = self._scheduler.recent.latest(request.count, include_rejected=True)
+        """Reply with the most recently ended goals that pass the filters."""
+        history, filters = self._speech.history, given_filters(request)
+        if request.history and history and (history.with_text or request.grep is None):
+            if not self._reserve_memory(pending):
+                raise RequestRefused("too many requests are waiting", Busy.code)
+            rows = await history.search(pending, filters, request.count)
+            pending.answer(self._history_items(pending, rows), count=len(rows))
+            return
+        # Only the goals in memory have texts that the history doesn't store.
+        records = self._scheduler.recent.latest(MAX_LOG_GOALS if filters else request.count, include_rejected=True)
+        records = [each for each in records if matches(filters, _filter_columns(each))][-request.count :]
         pending.answer(_goal_items("goal", records), count=len(records))
+
+    def _history_items(self, pending: PendingRequest, rows: list[Row]) -> Iterator[JsonObject]:
+        """Return an object for each row of the history. Count the memory of the rows until they are sent.
+
+        Goals that are still in memory are shown with their texts.
+        """
+        stream, size = pending.connection.stream, sum(map(row_chars, rows))
+        stream.adjust_held_bytes(size)
+
+        def items() -> Iterator[JsonObject]:
+            for row in rows:
+                goal = row_to_json(row)
+                record = self._scheduler.find(str(goal["id"]))
+                if record and record.ended_at == goal["ended_at"]:
+                    goal = record.snapshot().to_json()
+                yield {"goal": goal}
+            stream.adjust_held_bytes(-size)
+
+        return items()
 
     async def _set(self, pending: PendingRequest, request: Set) -> None:
         """Check and change the server's settings, and reply with all settings."""
@@ -475,6 +507,18 @@ def _goal_items(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:
     The goal is copied when the object is sent.
     """
     return ({name: each.snapshot().to_json()} for each in records)
+
+
+def _filter_columns(record: Record) -> JsonObject:
+    """Return the values of a goal in memory that the filters of `log` need."""
+    say, ended_at = record.say, record.ended_at or 0.0
+    return {
+        "ended_at": ended_at,
+        "state": record.state.name,
+        "name": record.sender.name,
+        "key": say.key,
+        "text": say.text,
+    }
 
 
 def _memory_of(value: object) -> int:

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from talkcli.goals.record import Record
     from talkcli.goals.scheduler import Scheduler
     from talkcli.server.connection import ClientConnection, WaitingList
+    from talkcli.server.history import History
 
 #: A clock that keeps running while the machine is suspended. On Linux, the usual monotonic clock stops then.
 _CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
@@ -87,6 +88,8 @@ class Speech:
         self._player_options = player_options
         #: the supervisor of the engine, set before the first client connects
         self.engine: Supervisor
+        #: stores the goals that have ended, or None
+        self.history: History | None = None
         #: called when `status_message` may have changed
         self.on_status_change: Callable[[], None] = lambda: None
         #: called when a goal was added to the queue or removed from it
@@ -253,6 +256,8 @@ class Speech:
         """Publish a goal's new state. If it has ended, log it and resume the requests that wait for it."""
         self.subscribers.state_changed(record, state, at)
         if state.terminal:
+            if self.history:
+                self.history.add(record.snapshot(state))
             _log_goal_end(record, monotonic_now() - record.began_at)
             resume_all(self.waiting_for_silence.pop(record, {}))
             resume_all(self.waiting_for_hearing.pop(record, {}))

@@ -48,7 +48,7 @@ ERRORS: list[tuple[str, dict[str, Any], type[Exception], str]] = [
     ("cancel", {"ids": ["nobody"]}, UnknownGoal, "nobody"),
     ("cancel", {"key": ""}, UsageError, "key"),
     ("goal", {"goal_id": "12"}, UnknownGoal, "-12"),
-    ("log", {"count": 0}, UsageError, "the count must be"),
+    ("log", {"count": 0}, UsageError, "'count' must be"),
     ("set", {"rate": 9}, UsageError, "the rate must be"),
     ("set", {"voice": "parrot"}, BadOption, "parrot"),
 ]

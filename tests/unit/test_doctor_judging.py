@@ -312,6 +312,8 @@ def test_another_users_socket_before_the_servers_one_is_a_warning() -> None:
         ({"volume": 0.0}, "settings", FAILURE, "talk set --volume 1"),
         ({"volume": 0.1}, "settings", WARNING, "talk set --volume 1"),
         ({"ttl": 5.0, "lead_in": 300, "preempt": True}, "settings", OK, "None"),
+        ({"history": {"path": "/h.db", "with_text": True, "error": None}}, "history", OK, "None"),
+        ({"history": {"path": "/h.db", "error": "disk full", "dropped": 3}}, "history", WARNING, "free some space"),
         ({"volume": 0.1 + 0.2, "ttl": 1.23456789012}, "settings", OK, "None"),
     ],
 )

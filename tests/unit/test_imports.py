@@ -23,7 +23,7 @@ PACKAGE = Path(talkcli.__file__).parent
 
 #: The layers. A layer may import itself and the layers before it.
 LAYERS = [
-    *("ground", "goals", "protocol", "terminal", "daemon", "engine"),
+    *("ground", "goals", "protocol", "terminal", "daemon", "history", "engine"),
     *("client", "aio", "server", "fleet", "doctor", "cli"),
 ]
 #: The modules of the ground, which import only each other.
@@ -35,6 +35,7 @@ PURE = [
     *("errors", "frozen", "client.core", "client.growing"),
     *("engine.child.cutting", "engine.child.words", "engine.markdown"),
     *("engine.child.synthesizers.guard", "engine.child.synthesizers.phonemes", "engine.child.synthesizers.vits"),
+    "history.rows",
     *("fleet.payloads", "fleet.topics", "fleet.bridge.policy"),
     *("fleet.desk.request", "fleet.desk.table"),
 ]
@@ -59,6 +60,7 @@ ALLOWED = {
     "asyncio": {"daemon", "server", "fleet", "aio"},
     "paho": {"fleet"},
     "platformdirs": {"paths"},
+    "sqlite3": {"history.file"},
 }
 
 
@@ -292,7 +294,7 @@ def test_only_the_cli_prints_and_exits() -> None:
 
 HEAVY = [
     *("asyncio", "pyttsx3", "click", "platformdirs", "espeakng_loader"),
-    *("paho", "talkcli.daemon", "talkcli.fleet", "talkcli.server", "talkcli.goals.scheduler"),
+    *("paho", "sqlite3", "talkcli.daemon", "talkcli.fleet", "talkcli.server", "talkcli.goals.scheduler"),
 ]
 #: Modules that would slow down every client. Importing one takes at least as long as a reply of the server.
 COSTLY = ["dataclasses", "inspect", "typing", "contextlib", "random", "socket", "logging", "subprocess", "tempfile"]
@@ -306,7 +308,8 @@ COSTLY = ["dataclasses", "inspect", "typing", "contextlib", "random", "socket", 
         ("from talkcli import Client", [*HEAVY, *COSTLY]),
         ("import talkcli.cli, talkcli.cli.plain", [*HEAVY, *COSTLY, "json", "re", "enum", "signal"]),
         ("import talkcli.protocol.lines", [*HEAVY, *COSTLY, "_json", "json", "re", "enum", "signal"]),
-        ("import talkcli.cli.ask, talkcli.cli.say, talkcli.cli.wait", [*HEAVY, *COSTLY]),
+        ("import talkcli.cli.ask, talkcli.cli.log, talkcli.cli.say, talkcli.cli.wait", [*HEAVY, *COSTLY]),
+        ("import talkcli.server.run", ["sqlite3"]),
         ("import talkcli.terminal.goals, talkcli.terminal.transcript, talkcli.cli.show, talkcli.cli.command", HEAVY),
     ],
 )

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
 def test_a_greeting_has_protocol_version_process_and_boot_id() -> None:
     message = greeting("1.2.3", 4711, "4k7f")
-    assert message == {"talk": 1, "version": "1.2.3", "pid": 4711, "boot": "4k7f", "features": ["append", "markdown"]}
+    features = ["append", "history", "markdown"]
+    assert message == {"talk": 1, "version": "1.2.3", "pid": 4711, "boot": "4k7f", "features": features}
     assert PROTOCOL == 1
     check_greeting(decode(encode(message)))
     check_greeting({**message, "features": ["pause"], "new": {"a": 1}})

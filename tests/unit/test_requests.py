@@ -10,17 +10,19 @@ from hypothesis import strategies as st
 
 from talkcli.errors import BadRequest
 from talkcli.goals.options import (
+    END_STATES,
     MAX_DATA_BYTES,
     MAX_ID_CHARS,
     MAX_IDS,
     MAX_LOG_GOALS,
     MAX_SENDER_NAME_CHARS,
     Cancel,
+    Log,
     Say,
 )
 from talkcli.protocol.events import failure
 from talkcli.protocol.lines import decode, encode, request_line, request_to_json
-from talkcli.protocol.requests import REQUEST_TYPES, Log, Request, Status, Wait, read_request
+from talkcli.protocol.requests import REQUEST_TYPES, Request, Status, Wait, read_request
 from tests.unit.test_lines import values
 
 if TYPE_CHECKING:
@@ -48,6 +50,8 @@ def requests_of(kind: type[Request]) -> st.SearchStrategy[Request]:
         "name": st.none() | st.text(min_size=1, max_size=MAX_SENDER_NAME_CHARS),
         "count": st.integers(1, MAX_LOG_GOALS),
         "at": st.none() | st.integers(0, 10**18),
+        "state": st.none() | st.sampled_from(END_STATES),
+        **dict.fromkeys(("since", "until"), st.none() | st.floats(-1e15, 1e15)),
     }
     return st.builds(kind, **{**fields, **optional, **{name: limited[name] for name in fields if name in limited}})
 
@@ -145,6 +149,7 @@ WRONG: dict[str, list[object]] = {
 }
 #: Invalid values of single fields.
 OUTSIDE: dict[str, list[object]] = {"hello name": ["", "a" * 65], "append at": [-1], "log count": [0, -1, 2_201]}
+OUTSIDE |= {"log state": ["", "PENDING", "aborted"], "log name": ["", "a" * 65], "log since": [1e16, -1e16, 10**400]}
 
 
 @pytest.mark.parametrize(

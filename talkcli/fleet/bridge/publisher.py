@@ -19,7 +19,7 @@ from talkcli.fleet.bridge.local import dial
 from talkcli.fleet.bridge.policy import PRIVATE_FIELDS
 from talkcli.fleet.payloads import LastGoal, Message, RobotStatus
 from talkcli.frozen import fields, replace
-from talkcli.goals.options import MAX_LOG_GOALS
+from talkcli.goals.options import MAX_LOG_GOALS, Log
 from talkcli.goals.states import State
 from talkcli.protocol.events import (
     PausedChanged,
@@ -32,7 +32,7 @@ from talkcli.protocol.events import (
 )
 from talkcli.protocol.features import FEATURES
 from talkcli.protocol.lines import decode, encode
-from talkcli.protocol.requests import Log, Watch
+from talkcli.protocol.requests import Watch
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -24,7 +24,7 @@ from talkcli.fleet.link import boottime
 from talkcli.fleet.payloads import Message
 from talkcli.frozen import replace
 from talkcli.goals.goal import By, Goal, Sender
-from talkcli.goals.options import SHOWN_OPTIONS, Append, Cancel, Say, Set
+from talkcli.goals.options import SHOWN_OPTIONS, Append, Cancel, Log, Say, Set
 from talkcli.goals.states import State
 from talkcli.protocol.events import Result, StateChanged, failure, item, ok
 from talkcli.protocol.lines import MAX_LINE_BYTES, decode, encode
@@ -77,7 +77,8 @@ class RemoteSessions:
             publish: publishes lines for a client, with a QoS of 0 or 1.
             max_payload: returns the size of the largest payload that the broker accepts, in bytes.
             on_change: called when the number of pending goals may have changed.
-            with_text: whether the status, the events and the answers to `watch` contain the texts of goals.
+            with_text: whether the status, the events and the answers to `watch`, to `log` and to a `status` with an id
+                contain the texts of goals.
         """
         self.name, self.socket, self.with_text = name, socket, with_text
         self.publish, self.max_payload = publish, max_payload
@@ -274,7 +275,9 @@ class RemoteSession:
             self._said_goodbye, self._reply_topic = False, request.reply_topic
         urgent = isinstance(request.request, Cancel | Status)
         limit = 2 * MAX_WAITING_BYTES if urgent else MAX_WAITING_BYTES
-        if len(self.unanswered) >= MAX_WAITING_REQUESTS:
+        if isinstance(request.request, Log) and request.request.grep is not None and not self._sessions.with_text:
+            self.refuse(request, "not_allowed", "the robot's bridge hides all texts (--no-text), so leave out grep")
+        elif len(self.unanswered) >= MAX_WAITING_REQUESTS:
             self.refuse(request, Busy.code, f"{MAX_WAITING_REQUESTS} requests of this client are already waiting")
         elif self._sessions.count_waiting_bytes() + request.size_bytes > limit:
             self.refuse(request, Busy.code, f"{MAX_WAITING_BYTES >> 20} MiB of requests are already waiting")
@@ -486,7 +489,8 @@ class RemoteSession:
             waits = isinstance(request, Wait) or (isinstance(request, Say) and (request.wait or request.feedback))
             if waits and state is not None and not state.terminal:
                 self._awaited.add(str(goal.get("id")))
-        if isinstance(request, Watch) and not self._sessions.with_text:
+        shows_others = isinstance(request, Watch | Log) or (isinstance(request, Status) and request.id is not None)
+        if shows_others and not self._sessions.with_text:
             message = policy.without_texts(message, policy.PRIVATE_FIELDS)
         found: list[JsonObject] = []
         if "ok" in message:

@@ -1,0 +1,6 @@
+"""The history: goals that have ended, in an SQLite file (`talk serve --history`).
+
+`rows` is pure: it turns goals into rows of the file's table, and applies the filters of a `log` request. `file` writes
+and searches the file, and is the only module that imports sqlite3. The server calls it in threads of their own
+(`server.history`). `talk log` calls it if no server is running.
+"""

@@ -1,0 +1,222 @@
+"""Writes and searches the SQLite file of a history.
+
+All functions may wait for the disk. If the file can't be used, they raise HistoryError.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sqlite3
+import stat
+import time
+from typing import TYPE_CHECKING
+from urllib.parse import quote
+
+from talkcli.errors import TalkError
+from talkcli.history.rows import COLUMNS, SCHEMA, to_row
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from talkcli.goals.goal import Goal
+    from talkcli.history.rows import Row
+
+    #: The device and inode number of a file.
+    FileIdentity = tuple[int, int]
+
+#: Goals that ended longer ago than this are deleted.
+MAX_AGE_S = 90 * 24 * 3600.0
+#: Maximum size of the goals and their indexes. The file never exceeds 64 MB together with its write-ahead log (WAL),
+#: which needs about 6 MB while goals are deleted.
+MAX_CONTENT_BYTES = 56_000_000
+#: Maximum size of the WAL if another program reads the file for a long time, so that the WAL can't be emptied.
+MAX_WAL_BYTES = 7_000_000
+#: If the file is full, this part of the goals is deleted, oldest first.
+_DELETED_FRACTION = 20
+#: How long to wait while another process writes to the file.
+_LOCK_WAIT_S = 2.0
+#: With NORMAL, a crash of the server loses no written goal, and a power failure only the newest ones. The WAL is copied
+#: into the file after 256 pages of 4 KiB. Deleted texts are overwritten.
+_PRAGMAS = (
+    "journal_mode = WAL",
+    "synchronous = NORMAL",
+    "wal_autocheckpoint = 256",
+    f"journal_size_limit = {256 * 4096}",
+    "secure_delete = ON",
+)
+_DELETE_OLDEST = f"""
+DELETE FROM goals WHERE number <=
+    (SELECT number FROM goals ORDER BY number LIMIT 1 OFFSET (SELECT count(*) / {_DELETED_FRACTION} FROM goals))
+"""
+_INSERT = f"INSERT INTO goals ({', '.join(COLUMNS)}) VALUES ({', '.join('?' * len(COLUMNS))})"
+#: SQLite's messages if the content of a file is invalid. Python 3.10 has no error codes.
+_DAMAGED = ("malformed", "not a database")
+#: How many steps of SQLite's virtual machine to execute between two checks of the time limit, which takes about 1 ms.
+_STEPS_PER_CHECK = 100_000
+
+
+class HistoryError(TalkError):
+    """The history can't be read or written."""
+
+    code = "history_failed"
+
+    def __init__(self, error: sqlite3.Error | OSError, file: FileIdentity | None) -> None:
+        """Create the error.
+
+        Args:
+            error: what has failed.
+            file: the file that was used, or None if there was none.
+        """
+        super().__init__(getattr(error, "strerror", None) or str(error))
+        #: the file if its content is invalid, or else None
+        self.damaged_file = file if any(each in str(error) for each in _DAMAGED) else None
+
+
+class HistoryWriter:
+    """Writes ended goals to a file, which it creates if necessary. Only one thread may use it."""
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+        self._connection: sqlite3.Connection | None = None
+        #: the file that was opened last
+        self._file: FileIdentity | None = None
+
+    def write(self, goals: Sequence[Goal], damaged_file: FileIdentity | None = None) -> str | None:
+        """Write goals in one transaction, and delete goals that are too old or don't fit.
+
+        If the file was removed or is damaged, start a new one.
+
+        Args:
+            goals: the goals, in the order in which they ended.
+            damaged_file: a file that a search has found to be damaged, or None.
+
+        Returns:
+            A message about a new file that replaces a removed or damaged one, or None.
+
+        Raises:
+            HistoryError: none of the goals was written.
+        """
+        try:
+            if damaged_file and damaged_file == _identity(self._path):
+                return self._start_anew(goals)
+            return self._write(goals)
+        except (sqlite3.Error, OSError) as error:
+            self.close()
+            failure = HistoryError(error, self._file)
+            if damaged_file or not failure.damaged_file:
+                raise failure from error
+        return self.write(goals, failure.damaged_file)
+
+    def close(self) -> None:
+        """Close the file if it is open. A transaction that has not been committed is rolled back."""
+        connection, self._connection = self._connection, None
+        if connection:
+            with contextlib.suppress(sqlite3.Error):
+                connection.close()
+
+    def _write(self, goals: Sequence[Goal]) -> str | None:
+        """Write goals, and delete others. Return a message if the file was removed."""
+        message = None
+        if self._connection and _identity(self._path) != self._file:
+            self.close()  # before a new file is created, because this may remove the WAL
+            message = f"{self._path} was removed or replaced, so a new history was started"
+        connection = self._connection = self._connection or self._open()
+        if _size(f"{self._path}-wal") > MAX_WAL_BYTES:
+            busy, *_ = connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
+            if busy:
+                raise sqlite3.OperationalError("another program has been reading the file for too long")
+        connection.execute("BEGIN IMMEDIATE")
+        connection.execute("DELETE FROM goals WHERE ended_at < ?", (time.time() - MAX_AGE_S,))
+        pages, free, page_bytes = (
+            connection.execute(f"PRAGMA {each}").fetchone()[0] for each in ("page_count", "freelist_count", "page_size")
+        )
+        if (pages - free) * page_bytes > MAX_CONTENT_BYTES:
+            connection.execute(_DELETE_OLDEST)
+        # SQLite releases the interpreter after each row, so other threads needn't wait until all rows are converted.
+        connection.executemany(_INSERT, map(to_row, goals))
+        connection.execute("COMMIT")
+        return message
+
+    def _open(self) -> sqlite3.Connection:
+        """Open the file, and create it if necessary. Return the connection."""
+        os.makedirs(os.path.dirname(self._path), mode=0o700, exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            os.close(os.open(self._path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o600))
+        status = os.lstat(self._path)
+        if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid():
+            raise FileExistsError("it is not a regular file of the server's user")
+        self._file = status.st_dev, status.st_ino
+        connection = sqlite3.connect(self._path, timeout=_LOCK_WAIT_S, isolation_level=None)
+        try:
+            for each in _PRAGMAS:
+                connection.execute(f"PRAGMA {each}")
+            connection.executescript(SCHEMA)
+        except BaseException:
+            connection.close()
+            raise
+        return connection
+
+    def _start_anew(self, goals: Sequence[Goal]) -> str:
+        """Rename a damaged file, and write goals to a new one. Return a message about this."""
+        self.close()
+        for suffix in ("", "-wal", "-shm"):
+            with contextlib.suppress(FileNotFoundError):
+                os.replace(self._path + suffix, f"{self._path}.damaged{suffix}")
+        self._write(goals)
+        return f"{self._path} was damaged; it was renamed to {self._path}.damaged, and a new history was started"
+
+
+def search(path: str, condition: str, values: Sequence[object], count: int, end: float) -> list[Row]:
+    """Return the newest rows that fulfil an SQL condition, oldest first. If there is no file, return no rows.
+
+    Args:
+        path: the file.
+        condition: the SQL expression, with placeholders.
+        values: the values of the placeholders.
+        count: the maximum number of rows.
+        end: the monotonic time at which to give up.
+
+    Raises:
+        HistoryError: the file can't be read, or reading takes too long.
+    """
+    file = _identity(path)
+    if file is None:
+        return []
+    query = f"SELECT {', '.join(COLUMNS)} FROM goals WHERE {condition} ORDER BY number DESC LIMIT ?"
+
+    def run(mode: str) -> list[Row]:
+        uri = f"file:{quote(os.fsencode(path))}?{mode}"
+        with contextlib.closing(sqlite3.connect(uri, timeout=_LOCK_WAIT_S, uri=True)) as connection:
+            connection.set_progress_handler(lambda: time.monotonic() > end, _STEPS_PER_CHECK)
+            return connection.execute(query, (*values, count)).fetchall()[::-1]
+
+    try:
+        try:
+            return run("mode=ro")
+        except sqlite3.OperationalError as error:
+            if "locked" in str(error) or time.monotonic() > end:
+                raise
+            # SQLite can't create the index of the WAL on a full or read-only disk. Read the file without the WAL.
+            return run("immutable=1")
+    except sqlite3.Error as error:
+        if time.monotonic() > end:
+            raise HistoryError(TimeoutError("the search took too long"), file) from error
+        raise HistoryError(error, file) from error
+
+
+def _identity(path: str) -> FileIdentity | None:
+    """Return the device and inode number of a file, or None if there is no file."""
+    try:
+        status = os.stat(path)
+    except FileNotFoundError:
+        return None
+    return status.st_dev, status.st_ino
+
+
+def _size(path: str) -> int:
+    """Return the size of a file in bytes, or 0 if there is no file."""
+    try:
+        return os.stat(path).st_size
+    except FileNotFoundError:
+        return 0

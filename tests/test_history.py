@@ -1,0 +1,285 @@
+"""`talk serve --history`: goals from before a restart, faults of the file, and what is stored."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import pwd
+import random
+import sqlite3
+import subprocess
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli import paths
+from talkcli.cli.log import HISTORY_FAILED
+from talkcli.errors import RequestRefused
+from talkcli.goals.goal import Goal
+from talkcli.goals.options import Log
+from talkcli.goals.states import State
+from talkcli.history.file import HistoryWriter
+from talkcli.server import history
+from talkcli.server.connection import PendingRequest
+from tests.conformance.bareserve import TALK, environment, run
+from tests.faults.test_surroundings import fill, mounted
+from tests.support.surroundings import clean_environment
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from tests.conftest import MakeTalk
+    from tests.support.processes import Talk
+
+
+def state(talk: Talk) -> dict[str, object]:
+    """Return the state of a server's history."""
+    found: dict[str, object] = talk.request("status")["server"]["history"]
+    return found
+
+
+def await_state(talk: Talk, meets: Callable[[dict[str, object]], object]) -> None:
+    """Wait until the state of a server's history meets a condition. No event reports this."""
+    end = time.monotonic() + 15
+    while not meets(state(talk)):
+        assert time.monotonic() < end, state(talk)
+        time.sleep(0.02)
+
+
+def await_written(talk: Talk) -> None:
+    await_state(talk, lambda found: found["unwritten"] == 0 and found["error"] is None)
+
+
+def stored_files(directory: str) -> bytes:
+    """Return the content of all files in a directory and its subdirectories."""
+    paths = [os.path.join(folder, name) for folder, _, names in os.walk(directory) for name in names]
+    content = b""
+    for path in paths:
+        with open(path, "rb") as file:
+            content += file.read()
+    return content
+
+
+@pytest.fixture
+def kept(make_talk: MakeTalk, tmp_path: Path) -> Talk:
+    """A server with a history in the state directory."""
+    return make_talk("--history", scripted=True, env={"XDG_STATE_HOME": str(tmp_path)})
+
+
+def test_goals_from_before_a_restart_are_shown_with_and_without_a_server(kept: Talk, tmp_path: Path) -> None:
+    first = kept.run("say", "--wait", "--as", "patrol", "--key", "door", "length=0 door open").id
+    failed = kept.run("say", "--wait", "fail=audio_lost").id
+    shown = {goal_id: kept.goal(goal_id) for goal_id in (first, failed)}
+    await_written(kept)
+    kept.kill()
+    without = kept.run("--json", "log")
+    assert [json.loads(line) for line in without.out.splitlines()] == [*shown.values()]
+    (path,) = [str(each) for each in (tmp_path / "talk").glob("*.db")]
+    assert (without.code, without.err) == (
+        0,
+        f"talk: no server is running, so these goals come from the history {path}\n",
+    )
+    kept.start_server()
+    last = kept.run("say", "--wait", "length=0").id  # not written yet
+    assert [line.split()[2] for line in kept.run("log").out.splitlines()] == [first, failed, last.partition("-")[2]]
+    assert [goal["id"] for goal in kept_goals(kept, history=False)] == [last]
+    for filters, ids in (
+        (["--as", "patrol"], [first]),
+        (["--key", "door"], [first]),
+        (["--state", "aborted"], [failed]),
+        (["--grep", "door op"], [first]),
+        (["--grep", "Door"], []),
+        (["--since", "2h", "-n", "2"], [failed, last]),
+        (["--until", "yesterday"], []),
+    ):
+        found = kept.run("--json", "log", *filters)
+        assert (found.code, [json.loads(line)["id"] for line in found.out.splitlines()]) == (0, ids), filters
+    for goal_id in (first, failed):
+        assert kept.goal(goal_id) == shown[goal_id]
+        assert f"id       {goal_id}" in kept.run("status", goal_id).out
+        assert [kept.run(command, goal_id).code for command in ("wait", "cancel")] == [8, 8]  # row 48
+    assert kept.run("status", "none").code == 8
+
+
+def kept_goals(talk: Talk, **fields: object) -> list[dict[str, object]]:
+    """Return the goals in the reply to `log`."""
+    with talk.connect() as wire:
+        reply = wire.request("log", **fields)  # type: ignore[arg-type]
+        assert reply["ok"], reply
+        return [item["goal"] for item in wire.items]
+
+
+def test_without_texts_only_the_memory_knows_them(make_talk: MakeTalk, tmp_path: Path) -> None:
+    env = {"XDG_STATE_HOME": str(tmp_path)}
+    talk = make_talk("--history", "no-text", scripted=True, env=env)
+    spoken = talk.run("say", "--wait", "--key", "k", "length=0 secret").id
+    failed = talk.run("say", "--wait", "fail=audio_lost message=secret secret").id
+    await_written(talk)
+    assert b"secret" not in stored_files(str(tmp_path))
+    assert kept_goals(talk, history=True)[0]["text"] == "length=0 secret"
+    assert [goal["id"] for goal in kept_goals(talk, history=True, grep="secret")] == [spoken, failed]
+    talk.stop()
+    talk.start_server()
+    assert [(goal["id"], goal["text"]) for goal in kept_goals(talk, history=True)] == [(spoken, None), (failed, None)]
+    assert kept_goals(talk, history=True, grep="secret") == []
+    talk.stop()
+    assert b"secret" not in stored_files(str(tmp_path))
+
+
+def test_a_silent_player_stores_goals_only_in_a_named_file(make_talk: MakeTalk, tmp_path: Path) -> None:
+    env = {"XDG_STATE_HOME": str(tmp_path)}
+    unnamed = make_talk("--player", "null", "--history", env=env, watched=False)
+    assert unnamed.request("status")["server"]["history"] is None
+    assert os.listdir(tmp_path) == []
+    assert "no history is kept, because the player null is silent" in unnamed.log
+    named = make_talk("--player", "null", "--history", f"{tmp_path}/h.db", env=env, watched=False)
+    await_written(named)
+    assert os.path.exists(tmp_path / "h.db")
+
+
+def test_a_history_needs_sqlite(tmp_path: Path) -> None:
+    code = "import sys; sys.modules['_sqlite3'] = None; from talkcli.cli import main; main()"
+    env = clean_environment(str(tmp_path), {"TALK_SOCKET": f"{tmp_path}/s"})
+    command = [sys.executable, "-c", code, "serve", "--player", "null", "--history", f"{tmp_path}/h.db"]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=20, check=False)
+    assert done.returncode == 2
+    assert "talk: --history needs the module sqlite3, which this Python lacks" in done.stderr
+
+
+def make_full(directory: str) -> None:
+    fill(directory)
+
+
+def make_read_only(directory: str) -> None:
+    subprocess.run(["mount", "-o", "remount,ro", directory], check=True)
+
+
+@pytest.mark.parametrize(("spoil", "restarts"), [(make_full, False), (make_full, True), (make_read_only, True)])
+def test_a_full_or_read_only_disk_is_reported_once_and_speech_goes_on(
+    make_talk: MakeTalk, tmp_path: Path, spoil: Callable[[str], None], *, restarts: bool
+) -> None:
+    disk = f"{tmp_path}/disk"
+    with mounted(disk, "size=300k"):
+        talk = make_talk("--history", f"{disk}/h.db", scripted=True)
+        ids = [talk.run("say", "--wait", "length=0").id]
+        await_written(talk)
+        if restarts:
+            talk.stop()
+            spoil(disk)
+            talk.start_server()
+        else:
+            spoil(disk)
+        ids.append(talk.run("say", "--wait", "length=0").id)
+        await_state(talk, lambda found: found["error"])
+        ids.append(talk.run("say", "--wait", "length=0").id)
+        assert [goal["id"] for goal in kept_goals(talk, history=True)] == ids
+        assert talk.log.count("can't be written") == 1
+        assert talk.run("doctor", "--silent").out.count("can't be written") == 1
+        talk.stop()
+        assert talk.log.count("are missing in the history") == 1
+
+
+def test_a_removed_or_damaged_file_is_replaced_and_reported_once(make_talk: MakeTalk, tmp_path: Path) -> None:
+    path = f"{tmp_path}/h.db"
+    talk = make_talk("--history", path, scripted=True)
+    talk.run("say", "--wait", "length=0")
+    await_written(talk)
+    os.unlink(path)
+    second = talk.run("say", "--wait", "length=0").id
+    await_state(talk, lambda found: found["replaced"])
+    await_written(talk)
+    assert [goal["id"] for goal in kept_goals(talk, history=True)] == [second]
+    os.truncate(f"{path}-wal", 0)
+    with open(path, "r+b") as damaged:
+        damaged.write(b"garbage " * (os.stat(path).st_size // 8))
+    assert talk.request("log", history=True)["error"]["code"] == HISTORY_FAILED
+    shown = talk.run("log")  # while the file is damaged, or just after it was replaced
+    assert (shown.code, "only the goals since the start" in shown.err) == (0, "\n" in shown.err)
+    await_state(talk, lambda found: "was damaged" in str(found["replaced"]))
+    assert kept_goals(talk, history=True) == []
+    assert os.path.exists(f"{path}.damaged")
+    for words in ("was removed", "was damaged"):
+        assert talk.log.count(words) == 1
+    assert talk.run("doctor", "--silent").out.count("was damaged") == 1
+
+
+def test_two_servers_store_in_the_same_file(make_talk: MakeTalk, tmp_path: Path) -> None:
+    talks = [make_talk("--history", f"{tmp_path}/h.db", scripted=True) for _ in range(2)]
+    ids = {each.run("say", "--wait", "length=0").id for each in talks}
+    for each in talks:
+        await_written(each)
+    for each in talks:
+        assert {goal["id"] for goal in kept_goals(each, history=True)} == ids
+
+
+@pytest.mark.parametrize("times", [2, pytest.param(50, marks=pytest.mark.slow)])
+def test_a_killed_server_loses_at_most_two_seconds_of_its_history(
+    make_talk: MakeTalk, tmp_path: Path, times: int
+) -> None:
+    path = f"{tmp_path}/h.db"
+    talk = make_talk("--history", path, scripted=True, watched=False)
+    for number in range(times):
+        killed_at = time.monotonic() + random.uniform(1.1, 2.5)
+        with talk.connect() as wire:
+            while time.monotonic() < killed_at:
+                last = wire.request("say", text="")["goal"]  # it is REJECTED, and so it has ended
+        talk.kill()
+        with contextlib.closing(sqlite3.connect(path)) as database:
+            assert database.execute("PRAGMA integrity_check").fetchall() == [("ok",)], number
+            newest = database.execute("SELECT ended_at FROM goals ORDER BY number DESC LIMIT 1").fetchone()[0]
+        assert last["ended_at"] - newest < 2, number
+        talk.start_server()
+
+
+def test_a_search_that_the_disk_does_not_answer_fails_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    responds = threading.Event()
+    monkeypatch.setattr(history, "search", lambda *_: responds.wait(20) and [])
+    monkeypatch.setattr(history, "SEARCH_LIMIT_S", 0.1)
+
+    async def run() -> None:
+        store = history.History(f"{tmp_path}/h.db", with_text=True)
+        failed = asyncio.get_running_loop().create_future()
+
+        async def steps() -> None:
+            try:
+                await store.search(pending, {}, 1)
+            except RequestRefused as error:
+                failed.set_result(error.code)
+
+        pending = PendingRequest(None, 1, Log())  # type: ignore[arg-type]
+        pending.start(steps())
+        assert await asyncio.wait_for(failed, 10) == HISTORY_FAILED
+        store.add(Goal("4k7f-1", State.SUCCEEDED, "door open", ended_at=time.time()))
+        responds.set()
+        store.close()  # writes the goal
+
+    asyncio.run(run())
+    assert b"door open" in stored_files(str(tmp_path))
+
+
+def test_a_history_of_another_user_is_named_with_its_owner(home: str) -> None:
+    """A directory without permissions stands for another user's, unless root runs the test."""
+    state = f"{home}/.local/state/talk"
+    os.makedirs(state)
+    env = environment(home, TALK_SOCKET=f"{home}/s")
+    socket = f"{home}/s"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HOME", home)
+        patch.delenv("XDG_STATE_HOME", raising=False)
+        path = paths.history_files(socket)[0]
+    HistoryWriter(path).write([])
+    os.chmod(path, 0)
+    command = [*TALK, "log"]
+    if os.getuid() == 0:
+        command = ["setpriv", "--reuid", "65534", "--clear-groups", *command]
+    done = run(command, env)
+    assert done.code == 3
+    assert done.err.startswith(f"talk: no server found; tried:\n  {socket}")
+    owner = pwd.getpwuid(os.getuid()).pw_name
+    assert done.err.endswith(f"the history {path} belongs to {owner}, and you may not read it\n")
