@@ -112,6 +112,7 @@ class Speak:
     format: str = "text"  # "text" or "markdown"
     more: bool = False  # whether text will be added with `Append`
     broken: bool = False  # whether the text broke off; an incomplete sentence at its end is not spoken
+    pronunciations: dict[str, str] | None = None  # terms of the text with their replacements
 
 
 @frozen

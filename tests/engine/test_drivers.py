@@ -17,6 +17,7 @@ from talkcli.engine import protocol
 from talkcli.engine.child.driver import register_driver
 from talkcli.engine.child.players.base import CannotSpeak
 from talkcli.engine.child.players.chooser import PlayerChooser
+from talkcli.engine.pronunciation import Pronunciations
 from talkcli.engine.voices import UnknownVoice
 from talkcli.frozen import replace
 from tests.engine.process import Engine, SharedEngine
@@ -137,6 +138,18 @@ def test_a_driver_gets_a_text_in_markdown_without_its_marks() -> None:
         engine.send(protocol.Speak("g1", "**battery** `low`", 200, 1.0, None, 50, format="markdown"))
         assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
         assert [(word.start, word.end) for word in engine.words()] == [(2, 9), (13, 16)]
+
+
+def test_a_driver_speaks_terms_as_replaced_and_resumes_within_the_sent_text() -> None:
+    with Engine(driver="timed", before=TIMED_DRIVER, alive_every=0.3) as engine:
+        terms = {"kW": "kilo watt", "ROS 2": "ross two"}
+        engine.send(protocol.Speak("g1", "5 kW for ROS 2 now", 200, 1.0, None, 50, pronunciations=terms))
+        engine.until_word(4)
+        engine.pause()
+        engine.resume()
+        assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
+        assert [(word.start, word.end) for word in engine.words()] == [(0, 1), (2, 4), (5, 8), (9, 12), (15, 18)]
+        assert _driver_texts(engine) == ["5 kilo watt for ross two now", "ross two now"]
 
 
 @pytest.mark.parametrize(
@@ -365,6 +378,7 @@ class Recorder:
         self.duration: float | None = None
         self.heard: float | None = None
         self.growing_text: GrowingText | None = None
+        self.pronunciations = Pronunciations({})
         #: the position and the duration at each notification
         self.times: list[tuple[float | None, float | None]] = []
         #: called for each word, and after each wait

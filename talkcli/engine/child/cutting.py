@@ -149,6 +149,10 @@ class GrowingText:
         start, self._position = self._position, end
         return start, end
 
+    def skip_to(self, end: int) -> None:
+        """Extend the last part to an offset, so that the next part begins there."""
+        self._position = max(self._position, end)
+
     def next_part_at(self, now: float, buffered_s: float) -> float:
         """Return the time at which the next part can be spoken if no more text is added.
 

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from talkcli.engine.child.synthesizers.base import Synthesizer
     from talkcli.engine.child.synthesizers.combined import CombinedSynthesizer
     from talkcli.engine.child.words import TimedWord
+    from talkcli.engine.pronunciation import SpokenText
 
 #: macOS drivers that speak only while this process runs Apple's run loop.
 _RUN_LOOP_DRIVERS = ("nsss", "avspeech")
@@ -335,7 +336,9 @@ class Driver:
         try:
             sound = self._sound
             for part, is_last in self._parts(text, playback):
-                self._synthesizer.speak(part, replace(sound, ends_text=is_last), playback)
+                playback.begin_part(part, is_last=is_last)
+                sound = replace(sound, ends_text=is_last, phonemes=part.has_phonemes)
+                self._synthesizer.speak(part.text, sound, playback)
                 sound = replace(sound, begins_text=False)
             runner.duration = round(playback.finish(), 6)
             runner.gaps = playback.gaps
@@ -348,22 +351,23 @@ class Driver:
         self._playback = None
         self._proxy.notify("finished-utterance", completed=runner.duration is not None)
 
-    def _parts(self, text: str, playback: Playback) -> Iterator[tuple[str, bool]]:
+    def _parts(self, text: str, playback: Playback) -> Iterator[tuple[SpokenText, bool]]:
         """Yield each part of a text once it can be spoken, and whether it is the last part.
 
         A text that doesn't grow is a single part. While text is missing, the playback continues.
         """
-        growing = self._runner.growing_text
+        growing, apply = self._runner.growing_text, self._runner.pronunciations.apply
         if growing is None:
-            yield text, True
+            yield apply(text), True
             return
         while True:
             now, buffered = time.monotonic(), playback.buffered()
             part = growing.take_next_part(now, buffered)
             if part is not None:
                 self._runner.report_text_missing(False)
-                playback.begin_part(part[0], is_last=growing.finished)
-                yield growing.text[slice(*part)], growing.finished
+                spoken = apply(growing.text, *part)
+                growing.skip_to(spoken.end)
+                yield spoken, growing.finished
             elif growing.finished:
                 return
             else:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from talkcli.engine.child.players.base import Interest, Player
     from talkcli.engine.child.runner import GoalRunner
+    from talkcli.engine.pronunciation import SpokenText
 
 #: Time allowed for a player to play its first sound. A sleeping Bluetooth or USB device needs one to two seconds, and a
 #: null sink that isn't being recorded needs up to two.
@@ -281,8 +282,10 @@ class Playback:
         self._in_background = False
         #: whether the player may have run dry because the text was missing, which doesn't count as a gap
         self._text_was_missing = False
-        #: start of the part that is being synthesized, as offsets in the text and in the samples
-        self._part_start = self._part_begin = 0
+        #: the part of the text that is being synthesized
+        self._part: SpokenText | None = None
+        #: offset in the samples at which the part begins
+        self._part_begin = 0
         #: whether another part may follow. It can be synthesized during the pause before it.
         self._part_follows = False
         #: lengths in seconds of the gaps caused by late samples
@@ -319,12 +322,14 @@ class Playback:
         """Schedule a word to be reported when it is heard.
 
         Args:
-            start: offset of the word in the current part of the text.
+            start: offset of the word in the current part of the text, as it is said.
             length: number of characters.
             audio_start: start of the word in the audio of this part, in seconds.
         """
         self._samples.audible = True
-        self._clock.add(TimedWord(self._part_start + start, length, self._seconds(self._part_begin) + audio_start))
+        located = self._part.locate(start, length) if self._part else (start, length)
+        if located:
+            self._clock.add(TimedWord(*located, self._seconds(self._part_begin) + audio_start))
 
     def write(self, samples: bytes) -> None:
         """Send samples to the player, except silence at the end. Wait until it has accepted them.
@@ -346,9 +351,9 @@ class Playback:
 
     # -- methods for the driver
 
-    def begin_part(self, start: int, *, is_last: bool) -> None:
+    def begin_part(self, part: SpokenText, *, is_last: bool) -> None:
         """Begin a new part of the text. The next samples belong to this part."""
-        self._part_start, self._part_begin, self._part_follows = start, self._samples.end, not is_last
+        self._part, self._part_begin, self._part_follows = part, self._samples.end, not is_last
 
     def buffered(self) -> float:
         """Return how many seconds of synthesized sound are still to be played.

@@ -19,6 +19,7 @@ import traceback
 from talkcli.engine import protocol
 from talkcli.engine.child.players.base import CannotSpeak
 from talkcli.engine.child.words import WordFinder
+from talkcli.engine.pronunciation import Pronunciations
 from talkcli.engine.voices import list_voices
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import MARKDOWN
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from talkcli.engine.child.players.chooser import PlayerChooser
     from talkcli.engine.child.synthesizers.combined import CombinedSynthesizer
     from talkcli.engine.markdown import MarkdownReader
+    from talkcli.engine.pronunciation import SpokenText
     from talkcli.goals.goal import Output
 
 #: Time between two steps of a third-party driver while it speaks. The driver is polled because it can't wake this
@@ -101,6 +103,10 @@ class ActiveGoal:
         #: the text, if it may still grow
         self.growing_text = _make_growing_text(self.text, command) if command.more or command.broken else None
         self.text_missing = False
+        #: how to say terms in the text
+        self.pronunciations = Pronunciations(command.pronunciations or {})
+        #: the text that a third-party driver is speaking
+        self.spoken_text: SpokenText | None = None
         #: number of characters received, and how many of them the server knows to be received
         self.length, self.reported_length = len(command.text), 0
         self.words = WordFinder(self.text)
@@ -114,8 +120,6 @@ class ActiveGoal:
         self.with_driver = False
         #: whether a third-party driver was stopped in order to pause the goal
         self.interrupted = False
-        #: offset in the text at which the driver started speaking
-        self.offset = 0
         #: offset in the text of the last word heard
         self.last_word = 0
         self.stop_requested = False
@@ -307,6 +311,11 @@ class GoalRunner:
             self._channel.send(protocol.VoiceChosen(goal.id, voice, fallback_reason or goal.fallback_reason))
 
     @property
+    def pronunciations(self) -> Pronunciations:
+        """How to say terms in the text of the current goal."""
+        return self._goal.pronunciations if self._goal else Pronunciations({})
+
+    @property
     def growing_text(self) -> GrowingText | None:
         """The text of the current goal, or None if it doesn't grow."""
         return self._goal.growing_text if self._goal else None
@@ -373,10 +382,12 @@ class GoalRunner:
     def _send_to_driver(self, goal: ActiveGoal) -> None:
         """Send the text to the driver, beginning at the last word heard."""
         goal.progress_at = goal.resumed_at = time.monotonic()
-        goal.offset = goal.last_word
         goal.with_driver, goal.interrupted = True, False
         # pyttsx3 refuses blanks, so a growing text is sent with its marks. The driver ignores this text anyway.
-        text = goal.command.text if goal.growing_text else goal.text[goal.offset :]
+        text = goal.command.text if goal.growing_text else goal.text
+        if self._step_run_loop is not None:
+            goal.spoken_text = goal.pronunciations.apply(goal.text, goal.last_word)
+            text = goal.spoken_text.text
         if self._engine.say(text, goal.id) is not None:
             self._fail_goal(Reason.NOTHING_TO_SAY, "nothing in the text can be spoken")
 
@@ -406,8 +417,8 @@ class GoalRunner:
         goal = self._goal
         if goal is None or goal.stop_requested or goal.interrupted:
             return
-        found = goal.words.find(goal.offset + location if location >= 0 else location, length)
-        if found is not None:
+        located = goal.spoken_text.locate(location, length) if goal.spoken_text else (location, length)
+        if located and location >= 0 and (found := goal.words.find(*located)):
             start, end, number = found
             goal.last_word, goal.progress_at = start, time.monotonic()
             seconds = goal.speech_seconds(goal.progress_at) if self.position is None else self.position

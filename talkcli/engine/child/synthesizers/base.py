@@ -36,6 +36,7 @@ class SpeechSettings:
     voice_only: bool = False  # whether to fail if the voice can't be used, instead of using another one
     begins_text: bool = True  # whether this is the first part of a text; silence before it may be cut
     ends_text: bool = True  # whether this is the last part of a text; a pause follows even without a mark
+    phonemes: bool = False  # whether "[[" and "]]" in the text enclose phonemes of libespeak-ng
 
 
 class SampleSink(Protocol):

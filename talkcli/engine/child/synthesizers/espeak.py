@@ -43,6 +43,9 @@ _DONT_EXIT = 0x8000
 #: This saves 4 to 40 ms.
 _ENGLISH = ("gmw/en", "en")
 
+#: A flag with which `[[` and `]]` enclose phonemes. pyttsx3's binding doesn't define it.
+_PHONEMES = 0x100
+
 #: The type of the event that reports the sample rate. pyttsx3's binding doesn't define it.
 _EVENT_SAMPLERATE = 8
 
@@ -226,7 +229,8 @@ class Espeak:
             return len(errors)
 
         espeak.SetSynthCallback(on_audio)
-        status = espeak.Synth(text.encode("utf-8", "replace"), flags=espeak.CHARS_UTF8 | espeak.ENDPAUSE)
+        flags = espeak.CHARS_UTF8 | espeak.ENDPAUSE | (_PHONEMES if settings.phonemes else 0)
+        status = espeak.Synth(text.encode("utf-8", "replace"), flags=flags)
         if errors:
             raise errors.pop()
         if status != espeak.EE_OK:
@@ -239,8 +243,10 @@ class Espeak:
         self.choose_voice(next((each.id for each in found if each), self.voice))
 
     @contextlib.contextmanager
-    def phonemizer(self, language: str) -> Iterator[EspeakPhonemizer]:
+    def phonemizer(self, language: str, *, phonemes: bool = False) -> Iterator[EspeakPhonemizer]:
         """Provide a phonemizer for a language in a `with` block.
+
+        With `phonemes`, the marks `[[` and `]]` in a text enclose phonemes.
 
         Another thread may use the phonemizer during the block, but nothing may use the synthesizer. After the block,
         calls of the phonemizer raise Stopped. If a call is still running at the end of the block, it continues for a
@@ -253,7 +259,7 @@ class Espeak:
         self._finish_phonemizer()
         voice = self._find_voice(language)
         voice_id = voice.id if voice is not None else ""
-        self._phonemizer = phonemizer = EspeakPhonemizer(self._espeak, voice_id)
+        self._phonemizer = phonemizer = EspeakPhonemizer(self._espeak, voice_id, phonemes=phonemes)
         if not voice_id or self._espeak.SetVoiceByName(voice_id.encode()) != self._espeak.EE_OK:
             raise UnknownVoice(f'{self.version} has no voice "{language}", which this voice needs for its phonemes')
         self._espeak.SetParameter(self._espeak.RATE, _ESPEAK_DEFAULT_WPM, 0)
@@ -292,13 +298,15 @@ class EspeakPhonemizer:
     Args:
         espeak: pyttsx3's binding of the library.
         voice: The id of the library's current voice.
+        phonemes: Whether `[[` and `]]` in a text enclose phonemes.
     """
 
-    def __init__(self, espeak: Any, voice: str) -> None:
+    def __init__(self, espeak: Any, voice: str, *, phonemes: bool = False) -> None:
         import threading
 
         self._espeak = espeak
         self._voice = voice
+        self._flags = espeak.CHARS_UTF8 | (_PHONEMES if phonemes else 0)
         #: a lock that is held during each call of the library
         self.busy = threading.Lock()
         self._ended = False
@@ -307,6 +315,8 @@ class EspeakPhonemizer:
 
     def clauses(self, text: str) -> list[tuple[str, str]]:
         """Split a text into clauses. Return each clause with its phonemes in IPA."""
+        # The next calls treat phonemes as the last call of `Synth` did, so speak a blank with the right flags.
+        self._speak_silently(" ")
         # The library reads ahead, and any other call discards that text. So get all clauses before doing anything else.
         raw = ctypes.create_string_buffer(guard.guarded(text, self._voice).encode("utf-8", "replace"))
         base = ctypes.addressof(raw)
@@ -378,7 +388,7 @@ class EspeakPhonemizer:
 
         with self._library_call():
             self._espeak.SetSynthCallback(on_audio)
-            self._espeak.Synth(text.encode("utf-8", "replace"), flags=self._espeak.CHARS_UTF8)
+            self._espeak.Synth(text.encode("utf-8", "replace"), flags=self._flags)
         return positions, next(iter(clause_ends), 0)
 
 
