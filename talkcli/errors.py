@@ -43,7 +43,7 @@ class UsageError(TalkError):
 
 
 class ServerUnavailable(TalkError):
-    """No server accepted the request. Nothing was sent, so it is safe to try again."""
+    """No server answered. The request had no lasting effect, so it is safe to try again."""
 
     code = "no_server"
     exit_code = 3
@@ -57,7 +57,7 @@ class AccessDenied(TalkError):
 
 
 class Lost(TalkError):
-    """The connection ended after a goal was sent. The goal may still be spoken."""
+    """A request was sent, but its result is unknown. A goal may still be spoken."""
 
     code = "lost"
     exit_code = 12

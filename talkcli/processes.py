@@ -19,7 +19,7 @@ _RELEASE_S = 0.01
 
 
 def open_pipes(count: int) -> list[tuple[int, int]]:
-    """Open pipes. Return both ends of each pipe.
+    """Open `count` pipes. Return the descriptors of both ends of each pipe.
 
     If one can't be opened, none is left open.
     """

@@ -96,7 +96,7 @@ class SpeechStream(StreamCalls):
     _handle_type = GoalHandle
 
     async def write(self, text: str) -> bool:
-        """Add text at the end. Return whether the goal accepts more.
+        """Add text at the end, and send it. Return whether the goal accepts more.
 
         If more than 10,000 characters have not been heard, the call waits until more of them have been heard.
         """

@@ -104,7 +104,7 @@ class LoopConnection(Connection):
         self._end_waits(NEVER)
 
     async def until(self, done: Callable[[], bool], deadline: float | None, *, interruptible: bool = True) -> bool:  # noqa: ARG002
-        """Suspend the coroutine until `done()` is true. Return False if the deadline passes first.
+        """Suspend the coroutine until `done()` is true. Return False at the deadline or the connection's end.
 
         The arguments are those of `wait_until`.
         """

@@ -101,7 +101,7 @@ class ServiceManager:
         self._timers[name] = self._loop.call_later(seconds, act)
 
     def _send(self, **fields: str) -> None:
-        """Send these fields to the service manager. Retry later if this fails.
+        """Send fields such as READY=1 to the service manager. If this fails, try again later.
 
         Fields from failed attempts are sent again.
         """

@@ -240,7 +240,7 @@ class BrokerExamination:
             return failure("bridge", wrong, remedy or step)
 
     def _run_limited(self, function: Callable[[], _Result]) -> _Result:
-        """Run a blocking function in a thread, with a time limit. Return its result.
+        """Run a blocking function in a thread. Return its result. Raise TimeoutError if it takes too long.
 
         Raises:
             TimeoutError: The work takes too long. The thread continues, but its result is ignored.

@@ -107,7 +107,7 @@ def connect(socket_option: str | None, interrupt: Mapping[int, int] | None) -> t
 
 
 def _find_refusal(error: TalkError, places: list[SocketPlace]) -> str | None:
-    """Find the line of an error message that says why a client was refused. Return the line, if any."""
+    """Return the line of an error message that says why a client was refused, if any."""
     lines = error.message.splitlines()
     if not lines[0].startswith(_NO_SERVER_PREFIX):
         return lines[0]

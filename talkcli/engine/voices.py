@@ -95,7 +95,7 @@ def matching_languages(wanted: str, voices: Sequence[Voice]) -> set[str]:
 
 
 def _matching_voices(wanted: str, voices: tuple[Voice, ...], server_voice: str | None = None) -> dict[str, Voice]:
-    """Return the voices that a name may refer to, each by its own unambiguous name."""
+    """Return the voices that a name may refer to, keyed by an unambiguous name for each."""
     for words in _possible_names(wanted, voices):
         fitting: dict[Voice, str] = {}
         for word in words:

@@ -136,7 +136,7 @@ class Goal:
 
     @property
     def exit_code(self) -> int | None:
-        """Exit code of a command that waits for this goal. It is None until the goal ends."""
+        """The exit code of a command that waits for this goal. It is None until the goal ends."""
         # Throttling is not a failure, because the sender asked for it.
         return 0 if self.reason == "throttled" else EXIT_CODES.get(self.state)
 

@@ -255,7 +255,7 @@ class Option:
 
     @property
     def flags(self) -> str:
-        """Command-line flags, or an empty string if there are none."""
+        """The command-line flags, or an empty string if there are none."""
         return self.special_flags or (f"--{self.name.replace('_', '-')}" if self.help else "")
 
     @property
@@ -293,7 +293,7 @@ class Option:
 
     @property
     def range(self) -> str:
-        """Description of the limits, or an empty string if there are none."""
+        """A description of the limits, or an empty string if there are none."""
         low, high = self.limits
         if low is None:
             return ""

@@ -14,7 +14,7 @@ _REJECTED, _ABORTED, _LOST = State.REJECTED, State.ABORTED, State.LOST
 
 
 class Reason(str, Enum):
-    """Machine-readable reason why a goal was rejected or didn't succeed.
+    """The machine-readable reason why a goal was rejected or didn't succeed.
 
     Its meaning never changes. `Goal.reason` is a plain string because a newer server may send a reason that this client
     doesn't know.

@@ -84,7 +84,7 @@ class Record:
 
     @property
     def text_bytes(self) -> int:
-        """Size of the text in bytes, or 0 after the text was dropped."""
+        """The size of the text in bytes, or 0 after the text was dropped."""
         return len(self.say.text.encode(errors="surrogatepass"))
 
     def change_state(self, state: State) -> None:

@@ -12,7 +12,7 @@ from talkcli.errors import TalkError
 
 
 class State(IntEnum):
-    """State of a goal, numbered as in actionlib. `str()` and f-strings return the name."""
+    """The state of a goal, numbered as in actionlib. `str()` and f-strings return the name."""
 
     PENDING = 0  # waiting in the queue
     ACTIVE = 1  # sent to the engine to be spoken

@@ -74,7 +74,7 @@ def unfinished(status: ServerStatus) -> list[Goal]:
 
 @frozen
 class Canceled:
-    """The result of a cancel request."""
+    """The goals that a request cancelled, and the goals named in it that had already ended."""
 
     #: the goals that were cancelled
     canceled: tuple[Goal, ...]
@@ -83,13 +83,13 @@ class Canceled:
 
     @classmethod
     def from_items(cls, items: list[JsonObject]) -> Canceled:
-        """Create the result from the list items that the server sent."""
+        """Read the goals from the list items in the server's answer to a cancel request."""
         return cls(tuple(goals(items, "canceled")), tuple(goals(items, "ended")))
 
 
 @frozen
 class StateChanged:
-    """Event sent when a goal's state changes."""
+    """An event that is sent when a goal's state changes."""
 
     id: str
     state: State
@@ -109,7 +109,7 @@ class StateChanged:
 
 @frozen
 class WordHeard:
-    """Event sent when a word can be heard."""
+    """An event that is sent when a word is heard."""
 
     id: str
     word: str
@@ -130,7 +130,7 @@ class WordHeard:
 
 @frozen
 class TextAdded:
-    """Event sent to watching clients when a goal's text has grown."""
+    """An event that is sent to watching clients when a goal's text has grown."""
 
     id: str
     #: position of the new text in the goal's text
@@ -146,7 +146,7 @@ class TextAdded:
 
 @frozen
 class TextMissing:
-    """Event sent when a goal becomes silent because text is missing, and when it continues."""
+    """An event that is sent when a goal falls silent because text is missing, and when it continues."""
 
     id: str
     #: whether the goal waits for text
@@ -161,7 +161,7 @@ class TextMissing:
 
 @frozen
 class PausedChanged:
-    """Event sent when all speech is paused or resumed."""
+    """An event that is sent when all speech is paused or resumed."""
 
     paused: bool
     #: id of the paused or resumed goal, or None if nothing was being spoken
@@ -178,7 +178,7 @@ class PausedChanged:
 
 @frozen
 class Result:
-    """Event sent when a goal has ended."""
+    """An event that is sent when a goal has ended, with the whole goal."""
 
     goal: Goal
 
@@ -189,10 +189,7 @@ class Result:
 
 @frozen
 class Snapshot:
-    """Event sent when a client starts to watch.
-
-    It has the state of the server and of all goals.
-    """
+    """An event with the state of the server and its goals, sent when a client starts to watch."""
 
     status: ServerStatus
 

@@ -85,7 +85,7 @@ class ServerSettings:
 
     @property
     def player_options(self) -> list[str]:
-        """Names of the player options that were given."""
+        """The names of the player options that were given."""
         given = {"--player": self.player, "--device": self.device, "--lead-in": self.lead_in}
         return [name for name, value in given.items() if value]
 

@@ -168,7 +168,7 @@ class ClientStream:
 
     @property
     def unsent_bytes(self) -> int:
-        """Size of the output that has not been sent yet."""
+        """The size of the output that has not been sent yet."""
         return len(self._unread)
 
     def adjust_held_bytes(self, added_bytes: int) -> None:

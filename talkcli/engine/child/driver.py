@@ -328,7 +328,7 @@ class Driver:
             self._sound = replace(self._sound, **{name: kind(value)})
 
     def _speak(self, text: str) -> None:
-        """Speak a text. Notify pyttsx3, and store the duration and the gaps in the runner."""
+        """Speak a text, and notify pyttsx3. Store the length of the sound and its gaps in the runner."""
         runner = self._runner
         self._proxy.notify("started-utterance")
         self._playback = playback = Playback(runner, self._notify_word)

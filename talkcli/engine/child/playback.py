@@ -101,7 +101,7 @@ class SentenceSamples:
 
     @property
     def end(self) -> int:
-        """Offset just after the last sample."""
+        """The offset just after the last sample."""
         return self.begin + len(self._kept)
 
     def add(self, samples: bytes) -> None:
@@ -223,7 +223,7 @@ class PlayerFeed:
         return self._seconds(byte_count) - self._clock.elapsed(now)
 
     def silent_for(self, now: float) -> float:
-        """Return for how many seconds the player has had nothing to play."""
+        """Return how many seconds the player has been without sound to play."""
         if self.written == 0 or self.time_left(self.written, now) > MIN_PLAYER_BUFFER_S:
             return 0.0
         return max(0.0, now - self._heard_at)

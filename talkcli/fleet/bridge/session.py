@@ -158,14 +158,14 @@ class RemoteSessions:
         return sum(each.size_bytes for session in self._sessions.values() for each in session.unanswered)
 
     def cancel_waiting(self, cancel: Cancel, canceled_by: By | None) -> list[Goal]:
-        """Cancel the bridge's waiting goals that match a `cancel` request. Return these goals."""
+        """Cancel the goals that wait in the bridge and match a `cancel` request. Return these goals."""
         selected = [self.waiting[each] for each in cancel.select_waiting([say for _, say, _ in self.waiting])]
         self.waiting = [each for each in self.waiting if not any(each is other for other in selected)]
         ending = State.RECALLED, "canceled", "not spoken: the goal was cancelled before it started", canceled_by
         return [session.end_goal(request, say, *ending) for request, say, session in selected]
 
     def handle_pending_change(self) -> None:
-        """Report a change of the pending goals, and schedule an attempt to send waiting goals.
+        """Call `on_change`, and schedule an attempt to send the goals that wait in the bridge.
 
         Call this whenever the number of pending goals may have changed. Events that were received together are all
         processed before goals are released.

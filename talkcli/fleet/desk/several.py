@@ -138,7 +138,7 @@ class FleetRequest:
 
     @property
     def why_disconnected(self) -> str | None:
-        """An error message if the broker is disconnected."""
+        """An error message while the broker is disconnected, otherwise None."""
         return None if self._desk.link else f"the connection to the broker at {self._desk.broker.url} was lost"
 
     def results(self, timeout: float | None = None) -> Iterator[Outcome]:
@@ -282,7 +282,7 @@ class FleetRequest:
                 self._on_presence(robot, presence)
 
     def _on_presence(self, robot: RobotRequest, presence: Presence) -> None:
-        """Include a robot in the request. If it is already included, record its ended goals.
+        """Include a new robot, and send it the request if necessary. For others, record their ended goals.
 
         Send the request if possible. After all retained messages have arrived, new robots are ignored, because they
         came online too late. Until then, every member of a group is expected to answer. Some members may have come
