@@ -26,7 +26,7 @@ else:
 
 #: Number of instances after which a class's `__init__` is compiled. With fewer instances, compiling would cost more
 #: time than it saves.
-_COMPILE_AFTER_COUNT = 100
+_COMPILE_AFTER_COUNT = 150
 
 
 @dataclass_transform(frozen_default=True)

@@ -126,6 +126,16 @@ def test_status_goal_voices_and_follow_show_the_servers_state(client: Client, sc
     assert followed[1].wait(1).state is State.PREEMPTED
 
 
+def test_sounds_are_listed_and_played(client: Client, scripted: Talk) -> None:
+    assert client.sounds() == ["chirp", "error", "warning"]
+    goal = client.play("chirp", key="bell", volume=0.5, data={"a": 1}).wait(5)
+    assert (goal.state, goal.format, goal.text, goal.key) == (State.SUCCEEDED, "sound", "chirp", "bell")
+    assert goal.spoken is None
+    refused = client.play("horn", block=False).wait(5)
+    assert (refused.state, refused.reason) == (State.REJECTED, "unknown_sound")
+    assert scripted.run("play", "--list").out.split() == client.sounds()
+
+
 def test_a_text_that_cannot_be_spoken_is_a_rejected_goal(client: Client) -> None:
     for text in ("", "\ud800", "a" * 100_000, "a\0b"):
         handle = client.say(text)

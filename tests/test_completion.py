@@ -160,6 +160,12 @@ def test_keys_and_voices_are_offered(busy: tuple[Talk, list[str]]) -> None:
     assert values("talk set --voice=e", talk) == ["--voice=en"]
 
 
+def test_sounds_are_offered(busy: tuple[Talk, list[str]]) -> None:
+    talk, _ = busy
+    assert values("talk play ", talk) == ["chirp", "error", "warning"]
+    assert values("talk play -w e", talk) == ["error"]
+
+
 def test_long_texts_are_shortened_and_untypable_keys_are_omitted(scripted: Talk) -> None:
     scripted.request("say", text=f"never-ends {'x' * 1000}", key="a\x1b[31mb")
     ((_, text),) = offered("talk cancel ", scripted.env)

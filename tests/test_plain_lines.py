@@ -138,7 +138,7 @@ def test_thousands_of_lines_are_parsed_and_sent_alike(arguments: list[str], envi
         *("say low", "say battery low --wait", "--json say -w -t 2.5 --preempt -- -3 degrees", "cancel"),
         "say --queue --priority -1 --key=battery --throttle 60 --rate 150 x",
         "say --id a-1 --voice de --volume 0.5 --pitch 99 --as me Grüße",
-        *("say --stream -w", "say --stream --stall 9 -"),
+        *("say --stream -w", "say --stream --stall 9 -", "play -w chirp", "play --list"),
         *("cancel --current 12 13", "status -q", "--socket /run/x status 12 --json", "wait 12 -t 10 -f"),
     ],
 )
@@ -163,6 +163,8 @@ def test_typical_script_lines_are_parsed_without_click(line: str) -> None:
         *(["status", "1", "2"], ["say", "x", "--ttl", "nan"], ["say", "x", "--key", ""], ["say", "x", "--wait=1"]),
         *(["say", "x", "--key", "k" * 65], ["say", "x", "--priority", "1000001"], ["say", "-o", "x.wav", "x"]),
         *(["say", "--stream", "x"], ["say", "--stall", "5", "x"], ["say", "--stream", "--stall", "0"]),
+        *(["play"], ["play", "a", "b"], ["play", ""], ["play", "--list", "a"], ["play", "--list", "-w"]),
+        *(["play", "a", "--rate", "90"], ["play", "a", "-f"], ["play", "a", "-t", "5"], ["play", "a", "--markdown"]),
     ],
 )
 def test_other_lines_are_parsed_by_click(line: list[str]) -> None:
@@ -182,6 +184,9 @@ def library_requests(parsed: plain.PlainCommand) -> tuple[Hello, Request]:
         text, options = " ".join(parsed.given["text"]), {name: parsed.given[name] for name in GOAL_OPTIONS}
         feedback = parsed.given["feedback"]
         return hello, Say(text, wait=parsed.given["wait"] or feedback, feedback=feedback, **options)
+    if command == "play":
+        options = {name: parsed.given[name] for name in GOAL_OPTIONS if name in parsed.given}
+        return hello, Say(parsed.given["sound"], wait=parsed.given["wait"], **{**options, "format": "sound"})
     if command == "cancel":
         given = parsed.given
         return hello, Cancel(given["ids"] or None, given["current"], given["before"], given["key"])
@@ -206,6 +211,7 @@ def test_any_text_is_sent_early_unchanged(text: str) -> None:
     "line",
     [
         *(["say", 'a "quoted" word'], ["say", "two\nlines"], ["say", "x", "--id", "a"], ["say", "x" * 10_000]),
+        *(["play", "chirp"], ["play", "-w", "--volume", "0.5", "--key", "k", "no such sound"]),
         *(["cancel", "4k7f-12"], ["cancel", "--before", "x"], ["cancel", "--key", "k"], ["status", "4k7f-12"]),
     ],
 )
@@ -219,7 +225,7 @@ def test_a_request_that_only_the_server_checks_is_sent_early(line: list[str]) ->
     "line",
     [
         *(["say", "x" * 10_001], ["say", "x", "--voice", "v" * 10_000], ["say", "x", "--as", "n" * 65]),
-        *(["say", "-"], ["say", "--lines"], ["say", "Gr\udcc3\udcbc"], ["wait"], ["log"]),
+        *(["play", "--list"], ["say", "-"], ["say", "--lines"], ["say", "Gr\udcc3\udcbc"], ["wait"], ["log"]),
         *(["cancel", "12"], ["cancel", "a", "a"], ["cancel", "i" * 65], ["cancel", ""], ["cancel", "--before", "12"]),
         *(["status", "12"], ["status", "i" * 65], ["cancel", "--key", "k" * 65]),
     ],

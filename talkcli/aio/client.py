@@ -25,6 +25,7 @@ from talkcli.client.goal import GoalCalls, end_time
 from talkcli.client.saying import SayingCalls
 from talkcli.client.stream import StreamCalls
 from talkcli.errors import UsageError
+from talkcli.goals.options import SOUND
 from talkcli.protocol.events import Result, WordHeard
 
 if TYPE_CHECKING:
@@ -160,6 +161,11 @@ class Client(ClientCalls):
         `saying`, or choose the `key` or the `id`.
         """
         return await self._say(GoalHandle, *text, **options)
+
+    @with_parameters_of(blocking.Client.say)
+    async def play(self, *text: str, **options: Any) -> GoalHandle:
+        """Send a sound to be played. Return the handle of its goal."""
+        return await self._say(GoalHandle, *text, format=SOUND, **options)
 
     @with_parameters_of(blocking.Client.say)
     def saying(self, *text: str, **options: Any) -> Saying:

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 _EXAMPLES = """
     talk serve &                      start the server
     talk say --wait -- "battery low"  speak; the exit code is the result
-    talk cancel                       be silent, now
     talk doctor                       find out why nothing is heard
 """
 #: Command names that users may know from other programs, with the equivalent commands of `talk`.

@@ -41,7 +41,7 @@ _NOT_A_TIME = {
 #: The words for a day, with the number of days before today.
 _DAYS_AGO = {"today": 0, "yesterday": 1}
 #: Options that can't be used with several robots.
-_SINGLE_ROBOT_OPTIONS = ("lines", "ahead", "stream", "feedback", "output")
+_SINGLE_ROBOT_OPTIONS = ("lines", "ahead", "stream", "feedback", "output", "list")
 
 #: All exit codes, for `talk --help`. The help of some commands describes them more specifically.
 ALL_EXIT_CODES: ExitCodes = {

@@ -76,7 +76,7 @@ _OTHER_EXTENSIONS = (".aac", ".aiff", ".au", ".flac", ".m4a", ".mp3", ".mp4", ".
 
 def _say_fault(values: Mapping[str, Any], typed: frozenset[str]) -> str | None:
     """Return an error message if the options of `say` are invalid or can't be combined."""
-    output, waits = values["output"], values["wait"] or values["feedback"]
+    output = values["output"]
     if output is not None:
         bad = [long_flag(each, values[each.name]) for each in _SAY_OPTIONS if each.name in typed - _SERVERLESS_OPTIONS]
         if bad:
@@ -84,11 +84,15 @@ def _say_fault(values: Mapping[str, Any], typed: frozenset[str]) -> str | None:
         extension = os.path.splitext(output)[1]
         if extension.lower() in _OTHER_EXTENSIONS:
             return "--output can only write WAV files; name the file .wav, and convert it with ffmpeg or sox"
-    if fault := _input_fault(values, typed):
-        return fault
+        return _input_fault(values, typed)
+    return _input_fault(values, typed) or _goal_fault(values)
+
+
+def _goal_fault(values: Mapping[str, Any]) -> str | None:
+    """Return an error message if options of `say` and `play` can't be combined."""
     if values["flush"] and values["preempt"] is False:
         return "--flush and --queue can't be combined; leave out one of them"
-    if values["timeout"] is not None and not waits and output is None:
+    if values["timeout"] is not None and not (values["wait"] or values.get("feedback")):
         return "--timeout only works with --wait; add --wait, or leave out --timeout"
     return None
 
@@ -109,6 +113,30 @@ def _input_fault(values: Mapping[str, Any], typed: frozenset[str]) -> str | None
     if not (values["lines"] or values["stream"] or text):
         return "TEXT is missing; type the sentence, or '-' to read standard input"
     return None
+
+
+def _play_options() -> Iterator[Option]:
+    """Yield the options of `play`, which are those of `say` that a sound can have."""
+    for each in _SAY_OPTIONS:
+        if not each.speech_only and each.name not in _TEXT_OPTIONS:
+            words = each.help.partition("  [env var with")[0].replace("it was spoken", "it was played")
+            words = words.replace("the sentence", "the sound").replace("his sentence", "his sound")
+            yield each if words == each.help else replace(each, help=words)
+    yield option("--list", FLAG, "Print the names of all sounds.")
+
+
+#: Options of `say` for texts and words, in addition to those that are `speech_only`.
+_TEXT_OPTIONS = {"feedback", "format", "lines", "ahead", "stream", "output"}
+_PLAY_OPTIONS = tuple(_play_options())
+
+
+def _play_fault(values: Mapping[str, Any], typed: frozenset[str]) -> str | None:
+    """Return an error message if options of `play` can't be combined."""
+    if values["list"]:
+        return "--list takes no NAME and no other options" if values["sound"] or typed - {"list"} else None
+    if not values["sound"]:
+        return "NAME is missing; to list the sounds, type: talk play --list"
+    return _goal_fault(values)
 
 
 _SERVE_OPTIONS = (
@@ -161,6 +189,7 @@ _SERVE_OPTIONS = (
         limits=(0, 100_000),
         metavar="MB",
     ),
+    option("--sounds", PATH, "Let 'talk play NAME' play DIR/NAME.wav.", metavar="DIR", completion="files"),
     option("--driver", TEXT, "Use this pyttsx3 driver. [default: the driver for this system]", metavar="NAME"),
     option(
         "--history",
@@ -272,6 +301,27 @@ _ROWS = (
         argument=Option("text", TEXT, metavar="TEXT..."),
         unknown_option_hint="To speak a text that starts with '-', type: talk say -- TEXT",
         rule=_say_fault,
+    ),
+    Command(
+        name="play",
+        summary="Play a sound.",
+        description="""
+        Play the sound NAME: chirp, warning, error, or a WAV file in the directory 'talk serve --sounds DIR'.
+
+        A sound is a goal like a sentence: it waits in the queue or interrupts, and it can be cancelled, paused and
+        awaited.
+        """,
+        function="say:play",
+        fleet_function="several:play",
+        examples="""
+        talk play chirp
+        talk play --wait --preempt warning
+        talk play --list
+        """,
+        options=_PLAY_OPTIONS,
+        argument=Option("sound", WORD, metavar="NAME", completion="sounds"),
+        unknown_option_hint="A sound has no voice, rate, pitch or words, but it can have a --volume",
+        rule=_play_fault,
     ),
     Command(
         name="wait",

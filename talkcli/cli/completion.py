@@ -220,6 +220,12 @@ def voices(options: CommonOptions, incomplete: str) -> Offers:
     return offers
 
 
+def sounds(options: CommonOptions, _: str) -> Offers:
+    """Return the names of sounds as completions."""
+    with options.connect(COMPLETION_TIMEOUT_S) as client:
+        return [(each, "sound") for each in client.sounds()]
+
+
 def robots(options: CommonOptions, _: str) -> Offers:
     """Return the names and groups of online robots as completions."""
     broker = options.broker()

@@ -17,7 +17,7 @@ from talkcli.cli.command import COMMON_OPTIONS, OUTPUT_FILE, read_value
 from talkcli.cli.commands import COMMANDS
 from talkcli.client.connect import hello, reach, send_early, sender_name, yield_processor
 from talkcli.frozen import TYPE_CHECKING, frozen
-from talkcli.goals.options import MAX_ID_CHARS, MAX_SENDER_NAME_CHARS, MAX_TEXT_CHARS, Cancel, Say, key_error
+from talkcli.goals.options import MAX_ID_CHARS, MAX_SENDER_NAME_CHARS, MAX_TEXT_CHARS, SOUND, Cancel, Say, key_error
 from talkcli.paths import named_robot, named_socket
 
 if TYPE_CHECKING:
@@ -34,7 +34,9 @@ if TYPE_CHECKING:
 
 _COMMON_NAMES = {each.name for each in COMMON_OPTIONS}
 #: Commands that may send their request before the rest of the program is imported.
-_EARLY_COMMANDS = ("say", "cancel", "status", "pause", "resume")
+_EARLY_COMMANDS = ("say", "play", "cancel", "status", "pause", "resume")
+#: Commands that send a goal.
+_GOAL_COMMANDS = ("say", "play")
 
 
 @frozen
@@ -135,7 +137,7 @@ def run(parsed: PlainCommand) -> int:
 
     def block_signals() -> None:
         # A signal must cancel the goal, so block signals until the command is able to do that.
-        wanted = {_signal.SIGINT, _signal.SIGTERM, _signal.SIGHUP} if command == "say" else set()
+        wanted = {_signal.SIGINT, _signal.SIGTERM, _signal.SIGHUP} if command in _GOAL_COMMANDS else set()
         blocked.update(wanted - _signal.pthread_sigmask(_signal.SIG_BLOCK, wanted))
 
     early = _connect_early(parsed, block_signals) if may_send_early(parsed) else None
@@ -157,7 +159,7 @@ def may_send_early(parsed: PlainCommand) -> bool:
     if named_robot(parsed.common.get("robot"), parsed.common.get("socket")):
         return False
     given = parsed.given
-    reads_input = given.get("lines") or given.get("stream") or given.get("text") == ("-",)
+    reads_input = given.get("lines") or given.get("stream") or given.get("text") == ("-",) or given.get("list")
     return parsed.command.name in _EARLY_COMMANDS and not reads_input
 
 
@@ -192,7 +194,7 @@ def _early_request(command: str, given: dict[str, Any]) -> JsonObject | None:
     """Return a command's request message if it is simple enough to send early."""
     from talkcli.protocol.lines import request_to_json
 
-    if command == "say":
+    if command in _GOAL_COMMANDS:
         say = _say_request(given)
         return request_to_json(say) if say else None
     if command == "cancel":
@@ -216,9 +218,13 @@ def _is_full_id(goal_id: str) -> bool:
 
 
 def _say_request(given: dict[str, Any]) -> Say | None:
-    """Return the request to speak a text. Return None if the text is invalid or too long."""
+    """Return the request to speak a text or to play a sound. Return None if the text is invalid or too long."""
     options = {each.name: given[each.name] for each in Say.options if each.name in given}
-    say = Say(**{**options, "text": " ".join(given["text"]), "wait": given["wait"] or given["feedback"]})
+    if "sound" in given:
+        options |= {"text": given["sound"], "format": SOUND}
+    else:
+        options |= {"text": " ".join(given["text"]), "wait": given["wait"] or given["feedback"]}
+    say = Say(**options)
     try:
         say.text.encode()
     except UnicodeEncodeError:

@@ -1,4 +1,4 @@
-"""The command `talk say`, which speaks a text or writes the speech to a file.
+"""The commands `talk say`, which speaks a text or writes the speech to a file, and `talk play`, which plays a sound.
 
 The modules `stdin` and `stream` read standard input. This module must not import click, because simple command lines
 are run without it. Only `-o` imports the engine, because it works without a server.
@@ -10,11 +10,19 @@ import os
 
 from talkcli.cli.command import read_value, replace_bad_bytes
 from talkcli.cli.interrupts import Interrupts, discard_unread_output
-from talkcli.cli.show import note, retry_without_output, show_error, show_if_possible, show_json, standard_output
+from talkcli.cli.show import (
+    note,
+    retry_without_output,
+    show_error,
+    show_if_possible,
+    show_json,
+    show_result,
+    standard_output,
+)
 from talkcli.cli.wait import GoalReporter, seconds_left, timeout_error
 from talkcli.errors import EXIT_OK, Lost, UsageError
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.goals.options import MARKDOWN, SOUND_OPTIONS
+from talkcli.goals.options import MARKDOWN, SOUND, SOUND_OPTIONS, STALL_S
 from talkcli.goals.states import State
 from talkcli.polling import Interrupted
 
@@ -67,7 +75,8 @@ def say(
 
         given = (options, name, {**goal_options, "stall": stall}, wait, feedback, timeout)
         return (StreamSpeaker(*given) if stream else LineSpeaker(*given, ahead=ahead)).run()
-    found = _read_input(options, timeout, wait, feedback, output) if text == ("-",) else " ".join(text)
+    is_input = text == ("-",) and goal_options["format"] != SOUND
+    found = _read_input(options, timeout, wait, feedback, output) if is_input else " ".join(text)
     if isinstance(found, int):
         return found  # nothing can be spoken
     sentence = replace_and_report_bad_bytes(found, options)
@@ -93,6 +102,22 @@ def say(
                 raise
             show_error(error, json=options.json)
     return interrupts.exit_code
+
+
+def play(options: CommonOptions, sound: str, list: bool, **given: Any) -> int:  # noqa: A002 - the option's name
+    """Play a sound, or print the names of all sounds. Return the exit code.
+
+    `given` contains the other options, which are explained in `say`.
+    """
+    if list:
+        from talkcli.terminal.text import printable
+
+        with options.connect() as client:
+            names = client.sounds()
+        show_result(options, [{"name": each} for each in names], lambda: map(printable, names))
+        return EXIT_OK
+    given |= {"feedback": False, "lines": False, "ahead": None, "stream": False, "stall": STALL_S, "output": None}
+    return say(options, (sound,), format=SOUND, **given)
 
 
 def _read_input(

@@ -56,6 +56,8 @@ def serve(options: CommonOptions, print_unit: str | None, **given: Any) -> int:
     is_named = "/" in (history or "")
     if is_named:
         given["history"] = os.path.abspath(history)
+    if given["sounds"]:
+        given["sounds"] = os.path.abspath(given["sounds"])
     if print_unit:
         mode, words = given["socket_mode"], []
         if print_unit.startswith("system") and "socket_mode" not in options.typed:
@@ -63,6 +65,8 @@ def serve(options: CommonOptions, print_unit: str | None, **given: Any) -> int:
             words.append("--socket-mode=0660")
         state = _STATE_DIRECTORY if history and not is_named else ""
         return _print_unit(options, "serve", print_unit, given, words, mode=f"{mode:04o}", state=state)
+    if given["sounds"] and not os.path.isdir(given["sounds"]):
+        raise UsageError(f"--sounds: {printable(given['sounds'])} is not a directory")
     if not options.quiet:
         _warn_about_sound(given["player"] or "", given["driver"])
     from talkcli.goals.options import SETTINGS, Set

@@ -1,6 +1,6 @@
 """The commands that can be sent to several robots with `--robot`.
 
-They are say, wait, cancel, status, set, pause and resume.
+They are say, play, wait, cancel, status, set, pause and resume.
 
 Each outcome is printed as a line `ROBOT ID STATE CODE` as soon as it arrives. The last line says how many robots have
 carried out the request. The same commands for a single server are in `say`, `wait` and `ask`.
@@ -19,7 +19,7 @@ from talkcli.cli.wait import CANCEL_TIMEOUT_S, seconds_left, timeout_error
 from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.errors import EXIT_DIFFER, EXIT_OK, EXIT_TIMEOUT, TalkError
 from talkcli.frozen import replace
-from talkcli.goals.options import Cancel, Say, Set
+from talkcli.goals.options import SOUND, Cancel, Say, Set
 from talkcli.polling import Interrupted
 from talkcli.protocol.requests import Pause, Request, Resume, Status, Wait
 from talkcli.terminal.goals import describe_end, setting_lines
@@ -59,6 +59,12 @@ def say(
     return _send_request(
         options, Say(replace_and_report_bad_bytes(sentence, options), wait=wait, **chosen), timeout, name
     )
+
+
+def play(options: CommonOptions, sound: str, wait: bool, timeout: float | None, name: str | None, **chosen: Any) -> int:
+    """Send a sound to each selected robot, and print the outcomes. Return the exit code."""
+    discard_unread_output()
+    return _send_request(options, Say(sound, wait=wait, format=SOUND, **chosen), timeout, name)
 
 
 def wait(options: CommonOptions, ids: tuple[str, ...], timeout: float | None) -> int:

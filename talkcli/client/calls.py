@@ -17,7 +17,7 @@ from talkcli.goals.options import MAX_ID_CHARS, MAX_IDS, Cancel, Log, Say, Set, 
 from talkcli.goals.states import State
 from talkcli.protocol.events import Canceled, ServerStatus, Snapshot, goal_in, goals
 from talkcli.protocol.lines import MAX_LINE_BYTES, request_line, request_to_json
-from talkcli.protocol.requests import Pause, Resume, Status, Voices, Wait, Watch
+from talkcli.protocol.requests import Pause, Resume, Sounds, Status, Voices, Wait, Watch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable
@@ -130,6 +130,11 @@ class ClientCalls:
         """Return the voices of the server's engine."""
         _, items = await self._connection.request(Voices())
         return [each["voice"] for each in items if isinstance(each.get("voice"), dict)]  # type: ignore[misc]
+
+    async def sounds(self) -> list[str]:
+        """Return the names of the sounds that can be played."""
+        _, items = await self._connection.request(Sounds())
+        return [str(each["sound"].get("name")) for each in items if isinstance(each.get("sound"), dict)]  # type: ignore[attr-defined]
 
     async def settings(self) -> JsonObject:
         """Return the server's settings, which are the defaults for new goals."""

@@ -17,7 +17,7 @@ from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.client.connection import ReconnectingConnection
 from talkcli.client.goal import GoalHandle
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.goals.options import STALL_S
+from talkcli.goals.options import SOUND, STALL_S
 from talkcli.polling import run_blocking
 
 if TYPE_CHECKING:
@@ -152,7 +152,7 @@ class Client:
 
         Raises:
             UsageError: a value is out of its range. Nothing was sent.
-            ProtocolMismatch: the server is too old for Markdown. Nothing was sent.
+            ProtocolMismatch: the server is too old for Markdown or sounds. Nothing was sent.
             ServerUnavailable: the server can't be reached. Nothing was sent. With `block=False`, this is raised only
                 if the client is closed.
             Lost: the goal was sent, but the server didn't answer. The goal may be spoken.
@@ -178,6 +178,19 @@ class Client:
         from talkcli.client.saying import Saying  # rarely needed, and slow to import
 
         return Saying(self._calls, text, **options)
+
+    @with_parameters_of(say)
+    def play(self, text: str, **options: Any) -> GoalHandle:
+        """Send a sound to be played. Return the handle of its goal.
+
+        A sound is a goal like a sentence, but it has no words. Its `text` is one of the names that `sounds` returns. If
+        there is no such sound, the goal is REJECTED with the reason `unknown_sound`. If its file can't be played, the
+        reason is `bad_sound`.
+
+        The arguments and errors are those of `say`. A sound can't have the arguments `rate`, `voice`, `voice_only`,
+        `pitch` and `format`.
+        """
+        return self.say(text, format=SOUND, **options)
 
     def stream(
         self,
@@ -322,6 +335,10 @@ class Client:
         None for both.
         """
         return run_blocking(self._calls.voices())
+
+    def sounds(self) -> list[str]:
+        """Return the names of the sounds that `play` can play."""
+        return run_blocking(self._calls.sounds())
 
     def settings(self) -> JsonObject:
         """Return the server's settings, which are the defaults for new goals.

@@ -47,6 +47,8 @@ ADVICE: dict[str, str] = {
     Reason.NOT_SILENT: "restart the server, because one of its players could not be killed",
     Reason.BAD_OPTION: "leave out the option that the message names",
     Reason.UNKNOWN_VOICE: "choose a voice that 'talk voices' lists: talk set --voice NAME",
+    Reason.UNKNOWN_SOUND: "choose a sound that 'talk play --list' lists",
+    Reason.BAD_SOUND: "follow the message's advice, or choose another sound: talk play --list",
     Reason.NOTHING_TO_SAY: "send a text in the voice's language, or choose a voice for the text: talk set --voice NAME",
     Reason.TEXT_STALLED: "make the program that writes the text faster, or wait longer: talk say --stream --stall 60",
     Reason.BROKEN_OFF: "find out why the program that sent the text ended early",

@@ -15,9 +15,10 @@ import stat
 import sys
 
 from talkcli import install
+from talkcli.engine.players import DEFAULT_RATE_HZ, RATES_HZ
 from talkcli.engine.protocol import Voice
 from talkcli.frozen import TYPE_CHECKING, frozen
-from talkcli.goals.options import NEURAL_PREFIX, SPEAKER_MARK
+from talkcli.goals.options import NEURAL_PREFIX, SPEAKER_MARK, without_speaker
 from talkcli.paths import voice_directories
 
 if TYPE_CHECKING:
@@ -42,8 +43,6 @@ _MAX_JSON_BYTES = 1 << 20
 _MAX_SPEAKERS = 4096
 #: The maximum lengths of a text shown to users, and of the name of a speaker.
 _MAX_SHOWN_CHARS, _MAX_SPEAKER_CHARS = 40, 64
-#: The sample rates in Hz that players support.
-_RATES_HZ = range(4000, 192001)
 #: The maximum number of ids per phoneme. Piper's voices use one. A model needs memory in proportion to the square of
 #: the number of ids in a sentence.
 _MAX_IDS_PER_PHONEME = 4
@@ -129,6 +128,14 @@ def read_description(path: str) -> VoiceDescription:
     except (OSError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         why = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         raise VoiceFileError(f"{json_path} does not describe a Piper voice ({why[:200]}); download it again") from error
+
+
+def voice_rate(voice: str) -> int:
+    """Return the sample rate of a voice. Return the rate of espeak if it isn't a neural voice or can't be read."""
+    try:
+        return read_description(find_models()[without_speaker(voice).removeprefix(NEURAL_PREFIX)]).rate
+    except (KeyError, VoiceFileError):
+        return DEFAULT_RATE_HZ
 
 
 def open_checked(path: str, advice_if_missing: str = "restore it", model_path: str = "") -> Any:
@@ -302,7 +309,7 @@ def _parse_description(content: Any) -> VoiceDescription:
         if not phoneme_ids.get(each):
             raise ValueError(f"phoneme_id_map has no {each}")
     rate = _checked_integer(content["audio"]["sample_rate"])
-    if rate not in _RATES_HZ:
+    if rate not in RATES_HZ:
         raise ValueError(f"unsupported sample rate: {rate}")
     inference = content.get("inference", {})
     names = content.get("speaker_id_map") or {}

@@ -18,6 +18,12 @@ if TYPE_CHECKING:
 #: The size of a sample in bytes (signed 16 bit, one channel).
 SAMPLE_BYTES = 2
 
+#: The sample rates in Hz that players support.
+RATES_HZ = range(4_000, 192_001)
+
+#: The sample rate in Hz of espeak's voices and of the built-in sounds.
+DEFAULT_RATE_HZ = 22_050
+
 #: Seconds of sound to offer to a player at a time. The pieces are short, so that little sound is played after a stop.
 PIECE_S = 0.02
 

@@ -89,6 +89,8 @@ class Configure:
     audible: bool = False
     #: the player to try first if `player` is None. None stands for the default order
     last_player: str | None = None
+    #: the directory of sounds; None for the built-in sounds only
+    sounds: str | None = None
 
 
 @frozen
@@ -109,7 +111,7 @@ class Speak:
     lead_in: int | None = None  # milliseconds of silence to play before the text; None to use `Configure.lead_in`
     audible: bool | None = None  # whether to fail if the output is muted; None to use `Configure.audible`
     voice_only: bool = False  # whether to wait for the neural voice to load, and fail if it can't be loaded
-    format: str = "text"  # "text" or "markdown"
+    format: str = "text"  # "text", "markdown", or "sound" if the text is the name of a sound
     more: bool = False  # whether text will be added with `Append`
     broken: bool = False  # whether the text broke off; an incomplete sentence at its end is not spoken
     pronunciations: dict[str, str] | None = None  # terms of the text with their replacements

@@ -92,16 +92,16 @@ class SpeechTimes:
 
         The goal must have been heard, at least in part.
         """
-        for each in (record.say.key, _digest(record.say.text)):
+        for each in (record.say.key, _digest(record.say.content)):
             if each is not None:
                 _set_newest(self._starts, each, (record.began_at, record.id), MAX_SPEECH_TIMES)
 
-    def last_goal_id(self, since: float, key: str | None, text: str) -> str | None:
-        """Return the id of the last goal started after `since` with this key (or text, if key is None).
+    def last_goal_id(self, since: float, key: str | None, content: str) -> str | None:
+        """Return the id of the last goal started after `since` with this key (or text or sound, if key is None).
 
         Return None if no such goal has started. Times are monotonic.
         """
-        last = self._starts.get(_digest(text) if key is None else key)
+        last = self._starts.get(_digest(content) if key is None else key)
         return last[1] if last is not None and last[0] > since else None
 
 

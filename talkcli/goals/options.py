@@ -54,6 +54,8 @@ TEXT_HISTORY, NO_TEXT_HISTORY = "text", "no-text"
 DEFAULT_VOICE = "default"
 #: Value of the option `format` for texts in Markdown.
 MARKDOWN = "markdown"
+#: Value of the option `format` for the name of a sound instead of a text.
+SOUND = "sound"
 #: Prefix of neural voice ids, as in "piper/NAME".
 NEURAL_PREFIX = "piper/"
 #: Separator between a neural voice and its speaker, as in "piper/NAME#3".
@@ -252,6 +254,8 @@ class Option:
     for_engine: bool = False
     #: whether a goal's JSON includes the value
     in_goal: bool = False
+    #: whether a sound can't have this option
+    speech_only: bool = False
 
     @property
     def flags(self) -> str:
@@ -279,7 +283,7 @@ class Option:
         if self.limits != (None, None) and self.is_out_of_range(value):
             return f"the {self.name} must be {self.range}{self.unit}, got {value}"
         if self.choices and value not in self.choices:
-            return f"the {self.name} must be {' or '.join(map(repr, self.choices))}, got {value[:MAX_ID_CHARS]!r}"
+            return f"the {self.name} must be one of {', '.join(map(repr, self.choices))}, got {value[:MAX_ID_CHARS]!r}"
         return self.check(value) if self.check else None
 
     def is_out_of_range(self, value: float) -> bool:
@@ -468,6 +472,7 @@ OPTIONS = (
         env="TALK_RATE",
         setting=Setting(200, words="rate {}"),
         for_engine=True,
+        speech_only=True,
     ),
     Option(
         "volume",
@@ -495,6 +500,7 @@ OPTIONS = (
             none_words="default voice",
         ),
         for_engine=True,
+        speech_only=True,
     ),
     Option(
         "voice_only",
@@ -504,6 +510,7 @@ OPTIONS = (
         default=False,
         help="Fail instead of speaking with another voice. Wait until the voice is loaded.",
         for_engine=True,
+        speech_only=True,
     ),
     Option(
         "pitch",
@@ -513,6 +520,7 @@ OPTIONS = (
         help="Set the pitch; 50 is normal. Neural voices don't support this option.",
         setting=Setting(50, words="pitch {}"),
         for_engine=True,
+        speech_only=True,
     ),
     Option(
         "lead_in",
@@ -542,6 +550,7 @@ OPTIONS = (
         FLAG,
         "whether text will be added with `append` while the goal waits or is spoken. `text` is then the beginning",
         default=False,
+        speech_only=True,
     ),
     Option(
         "stall",
@@ -552,14 +561,16 @@ OPTIONS = (
         limits=(MIN_STALL_S, MAX_STALL_S),
         unit=" seconds",
         help="With --stream, stop if no text arrives for TIME. The time starts when all of the text was spoken.",
+        speech_only=True,
     ),
     Option(
         "format",
         TEXT,
-        "how the text is written. The marks of Markdown are not spoken, see [Markdown](../cli/README.md#markdown)",
+        "how the text is written. The marks of Markdown are not spoken, see [Markdown](../cli/README.md#markdown). "
+        f"With `{SOUND}`, the text is the name of a [sound](../cli/README.md#sounds)",
         default="text",
-        choices=("text", MARKDOWN),
-        form=f"`text` or `{MARKDOWN}`",
+        choices=("text", MARKDOWN, SOUND),
+        form=f"`text`, `{MARKDOWN}` or `{SOUND}`",
         special_flags="--markdown",
         flag_value=MARKDOWN,
         help="Read TEXT as Markdown. Marks, code blocks, link addresses and emoji are not spoken.",
@@ -608,6 +619,16 @@ class Say:
     more: bool = False
     stall: float = STALL_S
     format: str = "text"
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether the text is the name of a sound."""
+        return self.format == SOUND
+
+    @property
+    def content(self) -> str:
+        """The text, with a mark in front of the name of a sound, because a text may be the same as a name."""
+        return f"\0{self.text}" if self.is_sound else self.text
 
 
 @frozen
@@ -803,10 +824,14 @@ def bad_option(request: Say | Set | Log) -> str | None:
         return "flush can't be combined with preempt false, because it always interrupts"
     if isinstance(request, Say) and request.more and request.throttle is not None and request.key is None:
         return "a growing text can only be throttled by its key, because its whole text isn't known yet"
+    is_sound = isinstance(request, Say) and request.is_sound
     for option in request.options:
         value = getattr(request, option.name)
-        if value != option.default and (words := option.value_error(value)):
-            return words
+        if value != option.default:
+            if is_sound and option.speech_only:
+                return f"a sound can't have the option {option.name}; leave it out"
+            if words := option.value_error(value):
+                return words
     return None
 
 

@@ -57,12 +57,12 @@ class Queue:
         """
         return None if key is None else self._by_key.get(key)
 
-    def with_text(self, text: str) -> Record | None:
-        """Return the first pending goal with this text, if any.
+    def with_content(self, content: str) -> Record | None:
+        """Return the first pending goal with this text or sound, if any.
 
         This is slow, because it checks every goal.
         """
-        return next((each for each in self if each.say.text == text), None)
+        return next((each for each in self if each.say.content == content), None)
 
     def goals_up_to(self, priority: int, *, only_preempting: bool) -> list[Record]:
         """Return the goals of this or a lower priority. Optionally leave out goals that don't preempt."""

@@ -59,6 +59,8 @@ class Reason(str, Enum):
         (_REJECTED, _ABORTED),
         "the engine doesn't have the voice, or a package is missing; `message` says what to install",
     )
+    UNKNOWN_SOUND = "unknown_sound", (_REJECTED, _ABORTED), "there is no sound with this name"
+    BAD_SOUND = "bad_sound", (_REJECTED, _ABORTED), "the file of a sound can't be played; `message` says why"
     ID_CONFLICT = "id_conflict", (_REJECTED,), "the id was already used for another text"
     NO_PLAYER = "no_player", (_ABORTED,), "no player is installed, and no sound server responds"
     AUDIO_DEVICE = "audio_device", (_ABORTED,), "the player can't start, or the sound server has only a dummy output"

@@ -87,6 +87,11 @@ class Record:
         """The size of the text in bytes, or 0 after the text was dropped."""
         return len(self.say.text.encode(errors="surrogatepass"))
 
+    @property
+    def was_heard(self) -> bool:
+        """Whether any of the goal was heard: a word, or some of a sound."""
+        return self.begun_end > 0 or (self.say.is_sound and self.heard > 0)
+
     def change_state(self, state: State) -> None:
         """Change the state of the goal. Raise IllegalTransition if the change isn't allowed."""
         if state not in TRANSITIONS[self.state]:
@@ -97,11 +102,13 @@ class Record:
         """Replace the text with a hash to save memory."""
         self.text_hash, self.say = hash(self.say.text[: self.first_chars]), replace(self.say, text="")
 
-    def was_sent_as(self, text: str) -> bool:
-        """Return whether the goal was sent with this text."""
+    def was_sent_as(self, say: Say) -> bool:
+        """Return whether the goal was sent with the text or the sound of this request."""
+        if say.is_sound is not self.say.is_sound:
+            return False
         if self.text_hash is not None:
-            return hash(text) == self.text_hash
-        return text == self.say.text[: self.first_chars]
+            return hash(say.text) == self.text_hash
+        return say.text == self.say.text[: self.first_chars]
 
     def snapshot(self, state: State | None = None) -> Goal:
         """Return an immutable copy of the goal, in its current state or in the given one.
@@ -116,8 +123,10 @@ class Record:
         if state is not State.PENDING:
             shown |= {name: getattr(self, name) for name in _FIELDS_SET_LATER}
             if self.started_at is not None:
-                shown |= {"spoken_end": self.spoken_end, "heard": self.heard}
-                shown["spoken"] = None if text is None else text[: self.begun_end]
+                shown["heard"] = self.heard
+                if not self.say.is_sound:
+                    shown["spoken_end"] = self.spoken_end
+                    shown["spoken"] = None if text is None else text[: self.begun_end]
         return Goal(
             id=self.id,
             state=state,

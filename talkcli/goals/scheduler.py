@@ -180,9 +180,9 @@ class Scheduler:
     def wanted_voice(self, record: Record) -> str:
         """Return the voice that a goal asks for, or the server's default voice.
 
-        An empty string stands for the driver's default voice.
+        An empty string stands for the driver's default voice. A sound needs no voice.
         """
-        return record.say.voice or self.settings.voice or ""
+        return "" if record.say.is_sound else record.say.voice or self.settings.voice or ""
 
     # -- requests from clients
 
@@ -212,7 +212,7 @@ class Scheduler:
             without effects.
         """
         first = self.find(say.id) if say.id is not None and options.is_clients_id(say.id) else None
-        if first is not None and first.was_sent_as(say.text):
+        if first is not None and first.was_sent_as(say):
             if say.more:
                 self._orphans.pop(first, None)
             return first, []
@@ -645,18 +645,18 @@ class Scheduler:
         if say.throttle is None:
             return None
         active = self.active
-        waiting = self.pending.with_text(say.text) if say.key is None else None
-        if active and (active.say.text == say.text if say.key is None else active.say.key == say.key):
+        waiting = self.pending.with_content(say.content) if say.key is None else None
+        if active and (active.say.content == say.content if say.key is None else active.say.key == say.key):
             first, words = active.id, "is being spoken"
         elif waiting:
             first, words = waiting.id, "is already waiting"
         else:
-            last = self._speech_times.last_goal_id(now.monotonic - say.throttle, say.key, say.text)
+            last = self._speech_times.last_goal_id(now.monotonic - say.throttle, say.key, say.content)
             if last is None:
                 return None
             first, words = last, f"was spoken less than {options.format_number(say.throttle)} s ago"
         record.by = By(goal=first)
-        what = "the same text" if say.key is None else "a goal with this key"
+        what = f"the same {'sound' if say.is_sound else 'text'}" if say.key is None else "a goal with this key"
         return Reason.THROTTLED, f"{what} {words}"
 
     def _may_preempt(self, say: Say) -> bool:
@@ -774,7 +774,8 @@ class Scheduler:
 
     def _start_time(self, record: Record) -> float:
         """Return the earliest monotonic time at which a goal may start instead of waiting for its voice."""
-        return self.voices.patience_end(record, self.settings.voice) if self._loads_voices else 0.0
+        waits = self._loads_voices and not record.say.is_sound
+        return self.voices.patience_end(record, self.settings.voice) if waits else 0.0
 
     def _start_next(self, now: Now) -> list[Effect]:
         """Start the next goal if possible. Return the effects.
@@ -846,7 +847,7 @@ class Scheduler:
         record.reason, record.message, record.by = reason, message, by
         record.ended_at, record.paused, record.more, record.waits = now.wall, False, False, False
         self._orphans.pop(record, None)
-        if record.begun_end and state is not State.ABORTED:
+        if record.was_heard and state is not State.ABORTED:
             self._speech_times.add(record)
         self._by_id.pop(record.id)
         self.recent.add(record)

@@ -20,6 +20,8 @@ FEATURES = {
     "append": ("growing texts", "more", True),
     "history": ("filters of the log", "history", True),
     "markdown": ("Markdown", "format", "markdown"),
+    "sound": ("sounds", "format", "sound"),
+    "sounds": ("lists of sounds", "request", "sounds"),
 }
 
 

@@ -90,6 +90,15 @@ class Voices:
 
 
 @frozen
+class Sounds:
+    """A request for the names of all sounds."""
+
+    kind: ClassVar[str] = "sounds"
+    meaning: ClassVar[str] = "List the sounds that can be played by name"
+    options: ClassVar[tuple[Option, ...]] = ()
+
+
+@frozen
 class Watch:
     """A request for the state of the server, and then for the events of all goals."""
 
@@ -116,7 +125,7 @@ class Resume:
     options: ClassVar[tuple[Option, ...]] = ()
 
 
-Request = Hello | Say | Append | Wait | Cancel | Status | Voices | Watch | Log | Set | Pause | Resume
+Request = Hello | Say | Append | Wait | Cancel | Status | Voices | Sounds | Watch | Log | Set | Pause | Resume
 
 REQUEST_TYPES: dict[str, type[Request]] = {each.kind: each for each in Request.__args__}
 

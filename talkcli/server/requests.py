@@ -24,7 +24,7 @@ from talkcli.goals.states import State
 from talkcli.history.rows import given_filters, matches, row_chars, row_to_json
 from talkcli.protocol.events import Result
 from talkcli.protocol.lines import encode
-from talkcli.protocol.requests import Pause, Request, Resume, Status, Voices, Wait, Watch
+from talkcli.protocol.requests import Pause, Request, Resume, Sounds, Status, Voices, Wait, Watch
 from talkcli.server.connection import PendingRequest, resume_all
 from talkcli.server.speech import MAX_UNHEARD_CHARS, describe_sender, unheard_chars
 
@@ -304,6 +304,8 @@ class Requests:
         if say.pitch not in {None, options.DEFAULTS.pitch} and options.is_neural(voice or ""):
             words = f"the voice {voice} has a fixed pitch; leave out the pitch, or use an espeak voice"
             refusal = refusal or (Reason.BAD_OPTION, words)
+        if say.is_sound:
+            refusal = self._speech.sounds.refusal(say.text)
         return say, pending.refusal or refusal
 
     async def _wait(self, pending: PendingRequest, request: Wait) -> None:
@@ -436,6 +438,11 @@ class Requests:
                 words += "; try again after the first sentence"
             raise RequestRefused(words, Reason.ENGINE_FAILED)
         pending.answer(({"voice": fields(each)} for each in voices), count=len(voices))
+
+    async def _sounds(self, pending: PendingRequest, _: Sounds) -> None:
+        """Reply with the names of all sounds."""
+        names = self._speech.sounds.names()
+        pending.answer(({"sound": {"name": each}} for each in names), count=len(names))
 
     async def _log(self, pending: PendingRequest, request: Log) -> None:
         """Reply with the most recently ended goals that pass the filters."""

@@ -19,6 +19,7 @@ from talkcli.engine import protocol
 from talkcli.engine.parent.supervisor import Supervisor
 from talkcli.engine.players import is_silent
 from talkcli.engine.protocol import START_LIMIT_S
+from talkcli.engine.sounds import SoundLibrary
 from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError, UsageError, memory_hint
 from talkcli.frozen import frozen
 from talkcli.goals.goal import JsonObject, Sender
@@ -75,6 +76,7 @@ class ServerSettings:
     lead_in: int = 0  # milliseconds of silence before a sentence if the device was idle
     audible: bool = False  # whether to abort a sentence if the output is muted
     driver: str | None = None
+    sounds: str | None = None  # directory of sounds
     #: memory limit for neural voices in MB, enough for four voices of medium size
     voice_memory: int = 300
     #: how to keep a history: TEXT_HISTORY, NO_TEXT_HISTORY, or the path of a file; None for no history
@@ -129,6 +131,7 @@ class Server:
         self.speech = Speech(self._scheduler, settings.player_options)
         self.speech.on_failure = self._begin_shutdown
         self.speech.voices.driver = settings.driver
+        self.speech.sounds = SoundLibrary(settings.sounds)
         self._systemd = ServiceManager(self._loop, self.speech.status_message)
         self.speech.on_status_change = self._systemd.schedule_status
         self.speech.history = self._open_history()
@@ -171,6 +174,7 @@ class Server:
                 voice,
                 settings.lead_in,
                 audible=settings.audible,
+                sounds=settings.sounds,
             ),
             speech.report,
         )

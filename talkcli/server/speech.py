@@ -19,6 +19,7 @@ from talkcli.daemon import log
 from talkcli.engine import protocol
 from talkcli.engine.parent.supervisor import EngineDied, EngineMissing, EngineSaid, Report, ThreadDied
 from talkcli.engine.players import NO_PLAYER_MESSAGE
+from talkcli.engine.sounds import SoundLibrary
 from talkcli.engine.voices import is_own_driver
 from talkcli.errors import TalkError, UsageError
 from talkcli.frozen import replace
@@ -101,6 +102,7 @@ class Speech:
         #: the latest engine's description of itself, or None before the first engine is ready
         self.ready: protocol.Ready | None = None
         self.voices = VoiceCatalog()
+        self.sounds = SoundLibrary(None)
         #: requests that are waiting for the engine's list of voices
         self.waiting_for_voices: WaitingList = {}
         #: goals that are waiting for room in the queue
@@ -456,7 +458,8 @@ def _log_goal_end(record: Record, seconds: float) -> None:
         cause = f" by {ended_by}" if ended_by else ""
         how += f" ({record.reason}{cause})"
     detail = f"; {log.sanitize(record.message)}" if record.state is State.ABORTED and record.message else ""
-    log.write(f'{how}: "{log.sanitize(record.say.text)}" from {describe_sender(record.sender)}{detail}')
+    sound = "sound " * record.say.is_sound
+    log.write(f'{how}: {sound}"{log.sanitize(record.say.text)}" from {describe_sender(record.sender)}{detail}')
 
 
 def _log_engine(engine: protocol.Ready, player_options: Sequence[str]) -> None:

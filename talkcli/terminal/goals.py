@@ -11,7 +11,7 @@ import time
 
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.goal import message_details
-from talkcli.goals.options import format_number
+from talkcli.goals.options import SOUND, format_number
 from talkcli.goals.states import State
 from talkcli.protocol.lines import encode
 from talkcli.terminal.text import COLUMN_GAP, ELLIPSIS, TEXT_COLUMNS, Screen, fit_row, pad, printable, width, wrap
@@ -95,7 +95,7 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
         ("reason", goal.reason and printable(goal.reason)),
         ("message", goal.message and printable(goal.message)),
         ("ended", _describe_cause(goal.by) if goal.by else None),
-        ("text", _quote(_shown_text(goal))),
+        ("sound" if goal.format == SOUND else "text", _quote(_shown_text(goal))),
         ("spoken", _quote(goal.spoken)),
         ("heard", goal.heard and goal.heard != goal.duration and f"{goal.heard:.2f} s of audio"),
         ("from", _describe_sender(goal.client)),
@@ -210,8 +210,8 @@ def _tail_forms(goal: Goal, screen: Screen, now: float) -> list[str]:
 
 
 def quoted_text(goal: Goal, limit: int | None = None) -> str:
-    """Return a goal's text in quotes, or a placeholder if it is no longer kept."""
-    return _quote(_shown_text(goal), limit) or TEXT_NOT_KEPT
+    """Return a goal's text or sound in quotes, or a placeholder if it is no longer kept."""
+    return "sound " * (goal.format == SOUND) + (_quote(_shown_text(goal), limit) or TEXT_NOT_KEPT)
 
 
 def _shown_text(goal: Goal) -> str | None:

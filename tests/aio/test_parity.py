@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 #: asynchronous context manager. The same method never waits.
 TABLE = {
     "Client": {
-        "awaited": "say follow cancel status goal log voices settings set pause resume close",
+        "awaited": "say play follow cancel status goal log voices sounds settings set pause resume close",
         "iterated": "events",
         "entered": "stream saying",
         "same": "path server_pid",
@@ -41,6 +41,7 @@ ERRORS: list[tuple[str, dict[str, Any], type[Exception], str]] = [
     ("say", {"text": "a", "key": ""}, UsageError, "key"),
     ("say", {"text": "a", "loud": True}, TypeError, "loud"),
     ("say", {}, TypeError, "text"),
+    ("play", {"text": "chirp", "rate": 200}, UsageError, "a sound can't have the option rate"),
     ("stream", {"stall": 0}, UsageError, "the stall must be"),
     ("stream", {"throttle": 5}, UsageError, "by its key"),
     ("follow", {"ids": [""]}, UsageError, "empty"),
@@ -82,8 +83,8 @@ def test_a_method_has_the_parameters_and_defaults_of_the_blocking_one(name: str,
     if kind == "same" and name == "Client":
         blocking, own = blocking.fget, own.fget
     if callable(own):
-        # The blocking method gets its parameters from `say` by a decorator for type checkers.
-        model = talkcli.Client.say if method == "saying" else blocking
+        # Some blocking methods get their parameters from `say` by a decorator for type checkers.
+        model = talkcli.Client.say if method in {"saying", "play"} else blocking
         assert inspect.signature(own).parameters == inspect.signature(model).parameters
 
 

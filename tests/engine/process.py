@@ -11,7 +11,7 @@ import time
 from typing import TYPE_CHECKING, TypeVar
 
 from talkcli.engine import protocol
-from talkcli.goals.options import is_neural
+from talkcli.goals.options import SOUND, is_neural
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -72,6 +72,7 @@ class Engine:
         lead_in: int = 0,
         list_voices: bool = True,
         alive_every: float | None = None,
+        sounds: str | None = None,
     ) -> None:
         """Start the process.
 
@@ -105,7 +106,11 @@ class Engine:
                 start_new_session=True,
             )
         os.close(inherited)
-        self.send(protocol.Configure(server or os.getpid(), driver, player, device, voice, lead_in, list_voices))
+        self.send(
+            protocol.Configure(
+                server or os.getpid(), driver, player, device, voice, lead_in, list_voices, sounds=sounds
+            )
+        )
 
     def __enter__(self) -> Engine:
         """Wait until the process accepts commands. The first event remains to be read."""
@@ -156,6 +161,9 @@ class Engine:
         self.send(
             protocol.Speak(goal, text, rate, 1.0, voice, pitch, next_waits, lead_in=lead_in, voice_only=voice_only)
         )
+
+    def play(self, sound: str, goal: str = "g1", *, volume: float = 1.0) -> None:
+        self.send(protocol.Speak(goal, sound, USUAL, volume, None, 50, format=SOUND))
 
     def pause(self, goal: str = "g1") -> float:
         """Pause the sentence, and return the seconds until the process confirmed silence."""

@@ -379,6 +379,7 @@ class Recorder:
         self.heard: float | None = None
         self.growing_text: GrowingText | None = None
         self.pronunciations = Pronunciations({})
+        self.sound = None
         #: the position and the duration at each notification
         self.times: list[tuple[float | None, float | None]] = []
         #: called for each word, and after each wait

@@ -128,6 +128,9 @@ def test_options_of_say_reach_all_robots(pair: RealRobots, desk: Desk) -> None:
         assert (goal["key"], goal["priority"], goal["text"]) == ("door", 7, "hello")
         assert 10 < goal["ttl"] <= 60
     assert [goal["ttl"] for goal in pair.each(lambda robot: robot.talk.goal("no-ttl"))] == [None, None]
+    assert desk.run("play", "--wait", "--id", "sound", "--key", "bell", "chirp").code == 0
+    for goal in pair.each(lambda robot: robot.talk.goal("sound")):
+        assert (goal["text"], goal["format"], goal["key"]) == ("chirp", "sound", "bell")
     throttled = desk.run("say", "--wait", "--throttle", "60", "--key", "charge", "I have to charge")
     assert {(state, code) for _, state, code in printed_outcomes(throttled).values()} == {("REJECTED", 0)}
     assert (throttled.code, throttled.err) == (0, ALL_SUCCEEDED)
@@ -161,6 +164,8 @@ NUMBER, ONE_ROBOT = "a goal's number is only valid on one server", "only works w
         ("say -wf hello", f"'talk say --feedback' {ONE_ROBOT}"),
         ("say -o - hello", "'talk say --output' only works on this machine"),
         ("say", "TEXT is missing"),
+        ("play", "NAME is missing"),
+        ("play --list", f"'talk play --list' {ONE_ROBOT}"),
         ("say --id 12 hello", "the id '12' is not allowed"),
         ("say --rate 9 hello", "must be 80 to 450 words per minute, got 9"),
         ("wait -f", f"'talk wait --feedback' {ONE_ROBOT}"),

@@ -44,6 +44,7 @@ ERRORS: tuple[tuple[str, tuple[str, ...]], ...] = (
         "--voice '' hello", "-o", "-o '' hello", "-o /nowhere/x.wav hello", "-o x.wav --key k hello", "--lines hello",
         "-- ''",
     )),
+    ("play", ("", "''", "a b", "--list a", "--list -w", "--rate 90 a", "-f a", "-t 5 a", "a")),
     ("wait", ("--timeout -1", "-t 0.1", "''")),
     ("cancel", ("", "''", "--before ''", "--key ''")),
     ("status", ("", "a b", "''")),
@@ -67,6 +68,7 @@ ERRORS: tuple[tuple[str, tuple[str, ...]], ...] = (
 REQUESTS: tuple[dict[str, Any], ...] = (
     {"request": "hello", "name": "golden"},
     {"seq": 1, "request": "voices"},
+    {"seq": 1, "request": "sounds"},
     {"seq": 2, "request": "status"},
     {"seq": 3, "request": "set"},
     {"seq": 4, "request": "set", "rate": 150, "volume": 0.5, "voice": "en", "pitch": 60, "preempt": True, "ttl": 9},

@@ -15,12 +15,14 @@ from tests.conformance.bareserve import TALK, serving
 from tests.readme.blocks import block, runs
 from tests.readme.shell import Shell, wait_until
 from tests.support.surroundings import short_directory
+from tests.support.wav import write_tone
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     import pytest
 
+    from tests.conftest import MakeTalk
     from tests.support.processes import Talk
 
 
@@ -206,3 +208,16 @@ def test_troubleshooting_commands_work(shell: Shell) -> None:
     assert done.stdout.count(") makes no sound") == 2
     path, version = shell.run(block("Another talk")).stdout.splitlines()
     assert (path, version.split()[0]) == (f"{shell.directory}/bin/talk", "talk")
+
+
+@runs("Sounds", "Sounds #2")
+def test_the_examples_for_sounds_play_them(make_talk: MakeTalk, shell: Shell) -> None:
+    (shell.directory / "sounds").mkdir()
+    write_tone(shell.directory / "sounds" / "horn.wav", 0.05, 22_050)
+    serve = block("Sounds #2").strip().replace("~", str(shell.directory)).split()[2:]
+    talk = make_talk(*serve, "--player", "null")
+    done = shell.run(block("Sounds"), TALK_SOCKET=talk.socket)
+    assert (done.returncode, done.stderr) == (0, ""), done
+    assert done.stdout.split()[3:] == ["chirp", "error", "horn", "warning"]
+    assert shell.run("talk play -w horn", TALK_SOCKET=talk.socket).returncode == 0
+    assert texts_of(talk)[-1] == "horn"

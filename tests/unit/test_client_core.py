@@ -126,6 +126,7 @@ def greet(core: ClientCore, boot: str = "4k7f", now: float = 2.0) -> None:
         ("markdown", ("other",), "the server (version 0.1.0) does not support Markdown; restart it"),
         ("markdown", ("markdown", "other"), None),
         ("markdown", None, None),  # the bridge of a robot didn't tell, so the server may refuse the request
+        ("sound", ("markdown",), "the server (version 0.1.0) does not support sounds; restart it"),
         ("text", (), None),
     ],
 )

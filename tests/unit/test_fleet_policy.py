@@ -25,7 +25,7 @@ from talkcli.goals.goal import Goal, Sender
 from talkcli.goals.options import MAX_SENDER_NAME_CHARS, Append, Cancel, Say, is_clients_id
 from talkcli.goals.states import State
 from talkcli.protocol.lines import MAX_LINE_BYTES
-from talkcli.protocol.requests import REQUEST_TYPES
+from talkcli.protocol.requests import REQUEST_TYPES, Sounds
 
 NOW = 1000.0
 OWN, PLAIN, CANCEL = (f"talk/robot/anna/{kind}/bob" for kind in ("request", "say", "cancel"))
@@ -160,7 +160,7 @@ def test_correlation_data_that_is_too_long_is_not_returned(fields: object, code:
 
 
 def test_every_kind_of_request_except_hello_and_watch_can_be_forbidden() -> None:
-    assert {*policy.ALLOWABLE_REQUESTS, *policy.ALWAYS_ALLOWED, "append"} == {*REQUEST_TYPES}
+    assert {*policy.ALLOWABLE_REQUESTS, *policy.ALWAYS_ALLOWED, *policy.ALLOWED_WITH_SAY} == {*REQUEST_TYPES}
     for kind in policy.ALWAYS_ALLOWED:
         assert accepted(decide(request({"request": kind}), allow=())).request.kind == kind
     for kind in policy.ALLOWABLE_REQUESTS:
@@ -168,6 +168,11 @@ def test_every_kind_of_request_except_hello_and_watch_can_be_forbidden() -> None
         assert refusal_code(decide(request(fields), allow=())) == "not_allowed"
         assert accepted(decide(request(fields), allow=(kind,))).request.kind == kind
     assert refusal_code(decide(request(b"hi", PLAIN), stale=True, allow=("cancel",))) == "not_allowed"
+
+
+def test_sounds_may_be_listed_where_sentences_are_allowed() -> None:
+    assert accepted(decide(request({"request": "sounds"}), allow=("say",))).request == Sounds()
+    assert refusal_code(decide(request({"request": "sounds"}), allow=("voices",))) == "not_allowed"
 
 
 @pytest.mark.parametrize("stale", [False, True])

@@ -59,7 +59,7 @@ GOOD: list[tuple[str, list[object]]] = [
     ("volume", [0, 0.0, 0.5, 1, 1.0]),
     ("pitch", [0, 50, 100]),
     ("lead_in", [0, 1, 5_000]),
-    ("format", ["text", "markdown"]),
+    ("format", ["text", "markdown", "sound"]),
     ("voice", ["en", "default", "French (France)"]),
     ("ttl", [0, 0.0, 0.001, 5, 86_400.0]),
     ("throttle", [0, 0.0, 0.5, 60]),
@@ -113,6 +113,16 @@ def test_an_option_outside_its_limits_is_refused_by_name(name: str, value: objec
         assert len(message) < 600
     if name in annotated(Set):
         assert name in str(bad_option(Set(**{name: value})))  # type: ignore[arg-type]
+
+
+def test_a_sound_has_no_options_of_speech() -> None:
+    values = {"rate": 200, "voice": "en", "voice_only": True, "pitch": 50, "more": True, "stall": 9}
+    for name, value in values.items():
+        message = f"a sound can't have the option {name}; leave it out"
+        assert bad_option(Say("chirp", format="sound", **{name: value})) == message  # type: ignore[arg-type]
+    assert {each.name for each in OPTIONS if each.speech_only} == values.keys()
+    others = {"volume": 0.5, "lead_in": 100, "audible": True, "key": "a", "throttle": 9, "ttl": 9, "feedback": True}
+    assert bad_option(Say("chirp", format="sound", **others)) is None  # type: ignore[arg-type]
 
 
 def test_flush_with_preempt_turned_off_is_refused() -> None:
@@ -288,7 +298,7 @@ def test_the_servers_defaults_agree_with_its_command() -> None:
         (ROWS["priority"], 1_000_001, "the priority must be -1,000,000 to 1,000,000, got 1000001"),
         (ROWS["key"], "", "the key must have 1 to 64 characters, got 0"),
         (ROWS["voice"], "", "the voice must not be empty"),
-        (ROWS["format"], "x" * 99, f"the format must be 'text' or 'markdown', got '{'x' * 64}'"),
+        (ROWS["format"], "x" * 99, f"the format must be one of 'text', 'markdown', 'sound', got '{'x' * 64}'"),
     ],
     ids=lambda value: getattr(value, "name", None) or str(value)[:24],
 )

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def test_a_greeting_has_protocol_version_process_and_boot_id() -> None:
     message = greeting("1.2.3", 4711, "4k7f")
-    features = ["append", "history", "markdown"]
+    features = ["append", "history", "markdown", "sound", "sounds"]
     assert message == {"talk": 1, "version": "1.2.3", "pid": 4711, "boot": "4k7f", "features": features}
     assert PROTOCOL == 1
     check_greeting(decode(encode(message)))

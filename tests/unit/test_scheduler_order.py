@@ -90,6 +90,12 @@ a key is not throttled after that time
     a key=k; completed a; pass 60; b key=k throttle=60  ->  b ACTIVE; a SUCCEEDED
 a text is throttled while it is spoken
     a; pass 99; b text=a throttle=60  ->  a ACTIVE; b REJECTED throttled by a
+a sound is throttled by its name
+    a format=sound; b text=a format=sound throttle=60  ->  a ACTIVE; b REJECTED throttled by a
+a sound is throttled after it was played
+    a format=sound; completed a; b text=a format=sound throttle=60  ->  a SUCCEEDED; b REJECTED throttled by a
+a sound and a text that is its name don't throttle each other
+    a; b text=a format=sound throttle=60; c text=a throttle=60  ->  a ACTIVE; b PENDING; c REJECTED throttled by a
 a text is not throttled by another text
     a; b throttle=60  ->  a ACTIVE; b PENDING
 a goal without a throttle is not throttled but throttles others
@@ -271,6 +277,8 @@ attaching still works after shutdown
     a id=mine; shutdown; b text=a id=mine  ->  a PREEMPTING shutdown; b is a
 another text with the same id is a conflict
     a id=mine; b id=mine flush  ->  a ACTIVE; b REJECTED id_conflict
+a sound and a text with the same id are a conflict
+    a id=mine; b id=mine text=a format=sound  ->  a ACTIVE; b REJECTED id_conflict
 another text is a conflict after the end of the first
     a id=mine; completed a; b id=mine  ->  a SUCCEEDED; b REJECTED id_conflict
 an id of the server's form attaches to nothing

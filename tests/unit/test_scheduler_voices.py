@@ -33,6 +33,8 @@ a goal waits until loading has taken ten seconds
     set voice=piper/joe; wait 4; a voice=piper/joe; wait 5.9  ->  a PENDING
 a goal starts once loading has taken ten seconds
     set voice=piper/joe; wait 4; a voice=piper/joe; wait 6  ->  a ACTIVE
+a sound does not wait for the server's voice
+    set voice=piper/joe; a format=sound; b  ->  a ACTIVE; b PENDING
 a goal that preempts does not wait
     a voice=piper/joe; b voice=piper/joe preempt  ->  b ACTIVE; a PENDING
 a goal that flushes does not wait

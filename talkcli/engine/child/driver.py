@@ -10,6 +10,7 @@ import sys
 import time
 import types
 from importlib import import_module
+from math import inf
 
 from talkcli import install
 from talkcli.engine import protocol, voices
@@ -334,13 +335,8 @@ class Driver:
         self._playback = playback = Playback(runner, self._notify_word)
         runner.duration = None
         try:
-            sound = self._sound
-            for part, is_last in self._parts(text, playback):
-                playback.begin_part(part, is_last=is_last)
-                sound = replace(sound, ends_text=is_last, phonemes=part.has_phonemes)
-                self._synthesizer.speak(part.text, sound, playback)
-                sound = replace(sound, begins_text=False)
-            runner.duration = round(playback.finish(), 6)
+            length = self._write_samples(text, playback)
+            runner.duration = round(min(playback.finish(), length), 6)
             runner.gaps = playback.gaps
         except Stopped:
             pass
@@ -350,6 +346,21 @@ class Driver:
         playback.release_player()
         self._playback = None
         self._proxy.notify("finished-utterance", completed=runner.duration is not None)
+
+    def _write_samples(self, text: str, playback: Playback) -> float:
+        """Send a text's speech or a sound to the playback. Return the sound's length, or infinity for speech."""
+        runner, settings = self._runner, self._sound
+        if runner.sound is not None:
+            from talkcli.engine.child.sounds import play_sound  # rarely needed
+
+            rate = runner.players.required_rate(runner.sound.voice)
+            return play_sound(runner.sounds, runner.sound, playback, rate)
+        for part, is_last in self._parts(text, playback):
+            playback.begin_part(part, is_last=is_last)
+            settings = replace(settings, ends_text=is_last, phonemes=part.has_phonemes)
+            self._synthesizer.speak(part.text, settings, playback)
+            settings = replace(settings, begins_text=False)
+        return inf
 
     def _parts(self, text: str, playback: Playback) -> Iterator[tuple[SpokenText, bool]]:
         """Yield each part of a text once it can be spoken, and whether it is the last part.

@@ -36,6 +36,7 @@ def main() -> None:
     from talkcli.engine.child.players.base import CannotKillPlayer
     from talkcli.engine.child.players.chooser import PlayerChooser
     from talkcli.engine.child.runner import Channel, GoalRunner
+    from talkcli.engine.sounds import SoundLibrary
 
     channel = Channel()
     configure = None
@@ -46,7 +47,7 @@ def main() -> None:
         return
     liveness = int(os.environ[protocol.LIVENESS_VARIABLE])
     os.set_inheritable(liveness, False)  # if the descriptor isn't open, fail now instead of at every sentence
-    runner = GoalRunner(channel, PlayerChooser(configure, [liveness]))
+    runner = GoalRunner(channel, PlayerChooser(configure, [liveness]), SoundLibrary(configure.sounds))
     try:
         channel.send(start(configure, runner))
         runner.run(send_voices=configure.list_voices)

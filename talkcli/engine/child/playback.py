@@ -318,6 +318,11 @@ class Playback:
             except CannotSpeak:
                 self._untried = self._first_error = None
 
+    def begin_sound(self, rate: int) -> None:
+        """Begin a sound instead of speech. It is played from its first sample, even if it is silent."""
+        self._samples.audible = self._start_known = True
+        self.begin(rate, "")
+
     def word(self, start: int, length: int, audio_start: float) -> None:
         """Schedule a word to be reported when it is heard.
 

@@ -22,7 +22,7 @@ from talkcli.engine.child.words import WordFinder
 from talkcli.engine.pronunciation import Pronunciations
 from talkcli.engine.voices import list_voices
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.goals.options import MARKDOWN
+from talkcli.goals.options import MARKDOWN, SOUND
 from talkcli.goals.reasons import Reason
 from talkcli.polling import NEVER, wait_ready
 from talkcli.protocol.lines import LineSplitter
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from talkcli.engine.child.synthesizers.combined import CombinedSynthesizer
     from talkcli.engine.markdown import MarkdownReader
     from talkcli.engine.pronunciation import SpokenText
+    from talkcli.engine.sounds import SoundLibrary
     from talkcli.goals.goal import Output
 
 #: Time between two steps of a third-party driver while it speaks. The driver is polled because it can't wake this
@@ -161,15 +162,17 @@ class GoalRunner:
     Call `attach_engine` once, and then `run`.
     """
 
-    def __init__(self, channel: Channel, players: PlayerChooser) -> None:
+    def __init__(self, channel: Channel, players: PlayerChooser, sounds: SoundLibrary) -> None:
         """Create a runner without an engine.
 
         Args:
             channel: the connection to the server.
             players: chooses the players for `talk`'s own driver.
+            sounds: the sounds that can be played.
         """
         self._channel = channel
         self.players = players
+        self.sounds = sounds
         self._goal: ActiveGoal | None = None
         self._engine: Any = None
         self._set_properties: Any = None
@@ -316,6 +319,12 @@ class GoalRunner:
         return self._goal.pronunciations if self._goal else Pronunciations({})
 
     @property
+    def sound(self) -> protocol.Speak | None:
+        """The command of the current goal if it is a sound, otherwise None."""
+        command = self._goal.command if self._goal else None
+        return command if command and command.format == SOUND else None
+
+    @property
     def growing_text(self) -> GrowingText | None:
         """The text of the current goal, or None if it doesn't grow."""
         return self._goal.growing_text if self._goal else None
@@ -360,10 +369,13 @@ class GoalRunner:
 
     def _speak(self, goal: ActiveGoal) -> None:
         """Speak a goal until it has ended."""
-        try:
-            goal.fallback_reason = self._set_properties(goal.command)
-        except CannotSpeak as error:
-            self._fail_goal(error.reason, str(error))
+        if self.sound is None:
+            try:
+                goal.fallback_reason = self._set_properties(goal.command)
+            except CannotSpeak as error:
+                self._fail_goal(error.reason, str(error))
+        elif self._step_run_loop is not None:
+            self._fail_goal(Reason.BAD_OPTION, "this driver can only speak, so it can't play sounds")
         if self._goal is goal and self._step_run_loop is not None and goal.command.lead_in:
             self._fail_goal(Reason.BAD_OPTION, "this driver plays the sound itself, so lead_in can't be used")
         if self._goal is goal and self._step_run_loop is not None and goal.growing_text:

@@ -16,7 +16,7 @@ from talkcli.frozen import frozen, replace
 from talkcli.goals.options import MAX_SENDER_NAME_CHARS, Append, Say
 from talkcli.protocol.events import failure, take_seq
 from talkcli.protocol.lines import MAX_LINE_BYTES, decode, encode
-from talkcli.protocol.requests import REQUEST_TYPES, read_request
+from talkcli.protocol.requests import REQUEST_TYPES, Sounds, read_request
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
@@ -28,8 +28,10 @@ if TYPE_CHECKING:
 STALE_CODE = "stale"
 #: Requests that are always allowed. They reveal nothing that the bridge doesn't publish anyway.
 ALWAYS_ALLOWED = ("hello", "watch")
-#: Requests that can be allowed with the option `--allow`. Clients that may use `say` may also use `append`.
-ALLOWABLE_REQUESTS = tuple(each for each in REQUEST_TYPES if each not in (*ALWAYS_ALLOWED, Append.kind))
+#: Requests that are allowed if `say` is.
+ALLOWED_WITH_SAY = (Append.kind, Sounds.kind)
+#: Requests that can be allowed with the option `--allow`.
+ALLOWABLE_REQUESTS = tuple(each for each in REQUEST_TYPES if each not in (*ALWAYS_ALLOWED, *ALLOWED_WITH_SAY))
 
 #: How often the bridge sends an echo to itself.
 ECHO_EVERY_S = 5.0
@@ -164,7 +166,7 @@ class Policy:
             if not repeatable:
                 raise BadRequest(f"correlation data must have at most {MAX_CORRELATION_BYTES} bytes", "bad_field")
             request = read_request(fields)
-            needed = Say.kind if isinstance(request, Append) else request.kind
+            needed = Say.kind if request.kind in ALLOWED_WITH_SAY else request.kind
             if needed not in self._allow:
                 words = f"this robot's bridge does not allow {needed} requests; add {needed} to its --allow"
                 raise BadRequest(words, "not_allowed")

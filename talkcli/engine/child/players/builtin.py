@@ -10,7 +10,7 @@ import struct
 import time
 
 from talkcli.engine.child.players.base import CannotSpeak, Player
-from talkcli.engine.players import FILE_PREFIX, SAMPLE_BYTES
+from talkcli.engine.players import FILE_PREFIX, RATES_HZ, SAMPLE_BYTES
 from talkcli.engine.protocol import OUTPUT_STREAM_NAME
 from talkcli.goals.reasons import Reason
 from talkcli.polling import NEVER, wait_ready
@@ -30,6 +30,8 @@ _WAV_HEADER = struct.Struct("<4sI4s4sIHHIIHH4sI")
 _RIFF_HEADER_BYTES = _WAV_HEADER.size - 8
 #: The value of both length fields in the header of a stream. Each field has 32 bits.
 _UNKNOWN_BYTES = 0xFFFFFFFF
+#: The offset of the sample rate in the header.
+_RATE_OFFSET = 24
 _MAX_WAV_BYTES = _UNKNOWN_BYTES - _WAV_HEADER.size
 
 
@@ -239,6 +241,17 @@ def _open_regular_file(path: str) -> int:
         os.close(file)
         raise CannotSpeak(Reason.AUDIO_DEVICE, f"{path} is not a regular file")
     return file
+
+
+def saved_rate(path: str) -> int | None:
+    """Return the sample rate of a WAV file written by `WavPlayer`. Return None if there is none."""
+    try:
+        file = _open_regular_file(path)
+    except (CannotSpeak, OSError):
+        return None  # `WavPlayer` will raise the same error
+    rate = int.from_bytes(os.pread(file, 4, _RATE_OFFSET), "little")
+    os.close(file)
+    return rate if rate in RATES_HZ else None
 
 
 def _header_fields(rate: int, sample_bytes: int) -> tuple[bytes | int, ...]:

@@ -12,8 +12,9 @@ from functools import partial
 from importlib import import_module
 
 from talkcli.engine.child.players.base import CannotSpeak
-from talkcli.engine.child.players.builtin import WavPlayer, WavStreamPlayer
+from talkcli.engine.child.players.builtin import WavPlayer, WavStreamPlayer, saved_rate
 from talkcli.engine.child.players.program import ProgramPlayer
+from talkcli.engine.models import voice_rate
 from talkcli.engine.players import FILE_PREFIX, PLAYERS, PlayerMissing, player_commands
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.reasons import Reason
@@ -142,6 +143,16 @@ class PlayerChooser:
         self._audible = self._configure.audible if command.audible is None else command.audible
         self.output = None
         self.handovers.next_waits, self.handovers.next_is_neural = command.next_waits, command.next_is_neural
+
+    def required_rate(self, voice: str | None) -> int | None:
+        """Return the sample rate that a sound must have. Return None if the player can play any rate.
+
+        All samples in a WAV file have the same rate. A new file gets the rate of this voice.
+        """
+        if self.takes_time:
+            return None
+        rate = saved_rate((self._configure.player or "").removeprefix(FILE_PREFIX))
+        return rate or voice_rate(voice or "")
 
     def record_output(self, player: Player) -> None:
         """Record the device, volume and mute state of a player's output, and which player works.
