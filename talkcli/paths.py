@@ -189,7 +189,7 @@ def history_files(named: str | None) -> list[str]:
 
 
 def _history_name(socket: str) -> str:
-    """Return the file name of a history. Each socket has another one."""
+    """Return the file name of the history of the server with this socket."""
     path = os.path.realpath(socket).lstrip("/")
     return f"{path.replace('%', '%25').replace('-', '%2d').replace('/', '-')}.db"
 

@@ -718,7 +718,7 @@ class ClientCore:
         self.listeners.end_watches(why, include_reconnecting=False)
 
     def connecting(self, hello: bytes) -> None:
-        """Prepare for a new connection, which begins with `hello`.
+        """Prepare for a new connection, and queue the bytes of its `hello` message.
 
         Requests wait for the server's greeting.
         """

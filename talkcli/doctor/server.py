@@ -282,7 +282,7 @@ def _judge_settings(server: JsonObject) -> Finding:
 
 
 def _judge_history(history: object) -> list[Finding]:
-    """Check whether the server can write its history. Return the finding, or nothing if there is no history."""
+    """Check whether the server can write its history. Return one finding, or none without a history."""
     if not isinstance(history, dict):
         return []
     path, error = history.get("path"), history.get("error")

@@ -108,7 +108,7 @@ class SpokenText:
         return original, term_chars
 
     def _map(self, place: int) -> tuple[int, int]:
-        """Return the section of an offset in the spoken text, and the offset in the sent text.
+        """Find an offset of the spoken text. Return its section, and the matching offset in the sent text.
 
         In a replaced term, only the section is valid.
         """
@@ -133,7 +133,7 @@ class Pronunciations:
                 self._by_chunk.setdefault(first.group().lower(), []).append((pattern, term))
 
     def apply(self, text: str, start: int = 0, end: int | None = None) -> SpokenText:
-        """Replace the terms in a text, or in the part from `start` to `end`."""
+        """Return a text, or its part from `start` to `end`, with all terms replaced."""
         end = len(text) if end is None else end
         return SpokenText(text, start, end, list(self._find(text, start, end)))
 
@@ -142,7 +142,7 @@ class Pronunciations:
         return Pronunciations({term: said for term, said in self.terms.items() if "[[" not in said})
 
     def _find(self, text: str, start: int, end: int) -> Iterator[Match]:
-        """Yield the terms that begin in a part of a text."""
+        """Yield each term that begins in a part of a text, with its place and its replacement."""
         at, added = start, 0
         for chunk in _CHUNK.finditer(text, start) if self.terms else ():
             begin = chunk.start()
@@ -172,7 +172,7 @@ def _is_word_character(character: str) -> bool:
 
 
 def parse_pronunciations(data: bytes) -> tuple[dict[str, str], list[str]]:
-    """Parse the content of a file of pronunciations. Return the terms, and a message about each faulty line."""
+    """Parse a file of pronunciations. Return the terms, and a message about each faulty line."""
     terms: dict[str, str] = {}
     lines: dict[str, int] = {}
     faults = []
@@ -229,7 +229,7 @@ class PronunciationFile:
             raise UsageError(f"--pronounce: {self.path} {self.problem}")
 
     def refresh(self) -> list[str]:
-        """Read the file again if it has changed. Return messages for the log, which are empty if nothing has changed.
+        """Read the file again if it has changed. Return messages for the log, if any.
 
         This never waits for a pipe or a device.
         """
@@ -257,7 +257,7 @@ class PronunciationFile:
         return [*shown, f"{self.path}: {more} more faulty lines"] if more > 0 else shown
 
     def to_json(self) -> JsonObject:
-        """Return a description for `status`."""
+        """Return the file's path, number of terms and faults for the reply to `status`."""
         return {
             "file": self.path,
             "terms": len(self.table.terms),
@@ -276,5 +276,5 @@ def _require_file(found: os.stat_result) -> os.stat_result:
 
 
 def _stamp(found: os.stat_result) -> tuple[int, ...]:
-    """Return values of which at least one changes when a file changes."""
+    """Return a file's times, size and identity, which show whether the file has changed."""
     return found.st_mtime_ns, found.st_ctime_ns, found.st_size, found.st_ino, found.st_dev

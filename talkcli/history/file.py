@@ -116,7 +116,7 @@ class HistoryWriter:
                 connection.close()
 
     def _write(self, goals: Sequence[Goal]) -> str | None:
-        """Write goals, and delete others. Return a message if the file was removed."""
+        """Write goals, and delete old ones. If the file was removed, start a new one and return a message."""
         message = None
         if self._connection and _identity(self._path) != self._file:
             self.close()  # before a new file is created, because this may remove the WAL
@@ -168,7 +168,7 @@ class HistoryWriter:
 
 
 def search(path: str, condition: str, values: Sequence[object], count: int, end: float) -> list[Row]:
-    """Return the newest rows that fulfil an SQL condition, oldest first. If there is no file, return no rows.
+    """Return the newest rows that fulfil an SQL condition, oldest first. A missing file has no rows.
 
     Args:
         path: the file.

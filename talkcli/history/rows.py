@@ -83,7 +83,7 @@ def to_row(goal: Goal) -> Row:
 
 
 def row_chars(row: Row) -> int:
-    """Return about how many characters a row has."""
+    """Return the approximate number of characters in a row."""
     return len(row[COLUMNS.index("text")] or "") + len(row[COLUMNS.index("other")])
 
 

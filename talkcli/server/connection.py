@@ -65,7 +65,7 @@ class Handler(Protocol):
         """Remove a client that has disconnected."""
 
     def handle(self, connection: ClientConnection, seq: int | None, request: Request) -> None:
-        """Start handling a client's request."""
+        """Start to carry out a client's request, which may be answered later."""
 
     def input_ended(self, connection: ClientConnection) -> None:
         """End a client's incomplete texts at the end of its input, unless others may continue them."""

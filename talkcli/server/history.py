@@ -116,7 +116,7 @@ class History:
         self._schedule_write()
 
     async def search(self, pending: PendingRequest, filters: Mapping[str, object], count: int) -> list[Row]:
-        """Return the rows of the newest goals that pass all filters, oldest first. Let the request wait for the disk.
+        """Return the rows of the newest goals that pass all filters, oldest first. Wait for the disk.
 
         Raises:
             RequestRefused: the file can't be read, or the disk doesn't respond in time.
@@ -171,7 +171,7 @@ class History:
     # -- writing
 
     def _schedule_write(self) -> None:
-        """Write soon if necessary. If many goals wait, start to write now."""
+        """Schedule a write if there is anything to write. If many goals wait, start at once."""
         if len(self._unwritten) >= BATCH_GOALS and not self._error:
             self._write()
         elif self._timer is None and (self._unwritten or self._damaged_file):
@@ -193,17 +193,17 @@ class History:
         self._write_thread.run_later(partial(self._write_batch, self._batch, damaged_file))
 
     def _write_batch(self, goals: Sequence[Goal], damaged_file: FileIdentity | None) -> None:
-        """Write goals in the writing thread, and report the result."""
+        """Write goals in the writing thread, and pass the outcome to `_handle_written`."""
         replaced: str | None = None
         error: Exception | None = None
         try:
             replaced = self._writer.write(goals, damaged_file)
         except Exception as failure:  # noqa: BLE001 - it is reported by the event loop
             error = failure
-        self._report(partial(self._handle_written, replaced, error))
+        self._call_in_loop(partial(self._handle_written, replaced, error))
 
     def _handle_written(self, replaced: str | None, error: Exception | None) -> None:
-        """Handle the result of an attempt to write. Log a change."""
+        """Keep the goals if writing has failed. Log new errors, and schedule the next write."""
         batch, self._batch, self._is_writing = self._batch, [], False
         if isinstance(error, HistoryError):
             self._unwritten.extendleft(reversed(batch))
@@ -240,20 +240,20 @@ class History:
         answer: list[list[Row] | Exception],
         waiting: WaitingList,
     ) -> None:
-        """Search the file in the searching thread. Add the rows or the error to `answer`, and resume the request."""
+        """Search the file in the searching thread. Store the rows or the error, and resume the request."""
         if time.monotonic() > end:
             return  # the request was refused long ago
         try:
             answer.append(search(self._path, *sql_condition(filters), count, end))
         except Exception as error:  # noqa: BLE001 - it is reported by the event loop
             answer.append(error)
-        self._report(partial(resume_all, waiting))
+        self._call_in_loop(partial(resume_all, waiting))
 
     def _refusal(self, problem: str) -> RequestRefused:
-        """Return the error for a request that needs the history."""
+        """Return the error for a request that the history can't answer because of a problem."""
         return RequestRefused(f"the history {self._path} {problem}; see: talk doctor", HistoryError.code)
 
-    def _report(self, callback: Callable[[], None]) -> None:
+    def _call_in_loop(self, callback: Callable[[], None]) -> None:
         """Call a function in the event loop's thread, unless the loop is closed."""
         with contextlib.suppress(RuntimeError):
             self._loop.call_soon_threadsafe(callback)

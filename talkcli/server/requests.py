@@ -54,7 +54,7 @@ REQUEST_BYTES = 8 * 1024
 
 
 class Requests:
-    """Handles the requests of all clients."""
+    """Carries out the requests of all clients, and replies to them."""
 
     def __init__(self, speech: Speech, describe: Callable[[], JsonObject]) -> None:
         """Create the handler.
@@ -74,7 +74,7 @@ class Requests:
         speech.on_queue_change = self._schedule_room_check
 
     def handle(self, connection: ClientConnection, seq: int | None, request: Request) -> None:
-        """Start handling a client's request."""
+        """Start to carry out a client's request, which may be answered later."""
         pending = PendingRequest(connection, seq, request)
         connection.unanswered[pending] = None
         pending.start(self._carry_out(pending))

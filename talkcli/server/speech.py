@@ -164,7 +164,7 @@ class Speech:
     # -- the scheduler's effects
 
     def advance_time(self) -> Now:
-        """Handle all time limits that have been reached. Return the current time."""
+        """Let the scheduler act on all time limits that have been reached. Return the current time."""
         now = Now(monotonic_now(), time.time())
         if self.scheduler.deadline() <= now.monotonic:
             self.apply(self.scheduler.tick(now))
@@ -274,7 +274,7 @@ class Speech:
             self._timer = self._loop.call_later(min(deadline - monotonic_now(), CLOCK_CHECK_S), self._tick)
 
     def _tick(self) -> None:
-        """Handle the time limits that have been reached, and set the timer for the next one."""
+        """Let the scheduler act on time limits that have been reached, and set the timer for the next one."""
         self.advance_time()
         self._set_timer()
 

@@ -150,7 +150,7 @@ class Transcript:
         return lines
 
     def _format_state_change(self, event: StateChanged, screen: Screen, now: float) -> list[str]:
-        """Update a stored goal after a state change. Return the lines that show it."""
+        """Update a stored goal after a state change. Return the lines that show the change."""
         if event.goal is not None:
             self._goals[event.id] = event.goal
             if len(self._goals) > _MAX_REMEMBERED_GOALS:  # the event for the end of the oldest goal was probably missed

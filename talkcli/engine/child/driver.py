@@ -174,7 +174,7 @@ class DriverProperties:
         engine.connect("error", self._record_error)
 
     def apply(self, command: protocol.Speak) -> str | None:
-        """Set the properties for a goal. Return the reason for a fallback voice, if any.
+        """Set the voice, rate, volume and pitch for a goal. Return the reason for a fallback voice, if any.
 
         A neural voice may have disappeared since the goal was accepted. The driver then falls back to another of its
         voices, preferably in the same language. It doesn't do so if `voice_only` is set.

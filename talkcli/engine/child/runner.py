@@ -315,7 +315,7 @@ class GoalRunner:
 
     @property
     def pronunciations(self) -> Pronunciations:
-        """How to say terms in the text of the current goal."""
+        """The pronunciations of terms in the text of the current goal."""
         return self._goal.pronunciations if self._goal else Pronunciations({})
 
     @property

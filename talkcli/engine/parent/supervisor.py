@@ -486,7 +486,7 @@ class Supervisor:
         self._kill_process(f"the engine crashed: {process.reap()}", Reason.ENGINE_CRASHED)
 
     def _handle_event(self, process: EngineProcess, event: protocol.Event) -> None:
-        """Update the goal that an event is about. Post any other event, and send the waiting goal."""
+        """Record an event of the current goal. Post any other event, and send the waiting goal if possible."""
         self._last_sign_at = time.monotonic()
         if isinstance(event, protocol.GoalEvent):
             goal = self._current_goal(event.id)
@@ -504,7 +504,7 @@ class Supervisor:
         self._send_waiting_goal()
 
     def _handle_goal_event(self, goal: SupervisedGoal, event: protocol.GoalEvent) -> None:
-        """Update the goal after an event. Post the event if the server needs it."""
+        """Record that the goal started, fell silent or ended. Post the event if the server needs it."""
         if isinstance(event, protocol.Started):
             goal.started = True
         elif isinstance(event, protocol.Ended):
