@@ -173,10 +173,15 @@ def cache_directory() -> str:
     return os.path.join(_user_directory(os.environ.get("XDG_CACHE_HOME"), "~/.cache"), "talk")
 
 
-def history_file(socket: str) -> str:
-    """Return the path of the history of the server with this socket. The directory may not exist yet."""
+def history_file(option: str, socket: str) -> str:
+    """Return the path of a server's history. Its directory may not exist yet.
+
+    Args:
+        option: the value of --history, which is the path if it contains "/".
+        socket: the path of the server's socket.
+    """
     given = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
-    return os.path.join(given or _state_directory(), _history_name(socket))
+    return option if "/" in option else os.path.join(given or _state_directory(), _history_name(socket))
 
 
 def history_files(named: str | None) -> list[str]:

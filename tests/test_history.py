@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import json
 import os
-import pwd
 import random
 import sqlite3
 import subprocess
@@ -179,10 +178,9 @@ def test_a_full_or_read_only_disk_is_reported_once_and_speech_goes_on(
         await_state(talk, lambda found: found["error"])
         ids.append(talk.run("say", "--wait", "length=0").id)
         assert [goal["id"] for goal in kept_goals(talk, history=True)] == ids
-        assert talk.log.count("can't be written") == 1
-        assert talk.run("doctor", "--silent").out.count("can't be written") == 1
+        assert talk.log.count("can't write to") == 1
+        assert talk.run("doctor", "--silent").out.count("can't write to") == 1
         talk.stop()
-        assert talk.log.count("are missing in the history") == 1
 
 
 def test_a_removed_or_damaged_file_is_replaced_and_reported_once(make_talk: MakeTalk, tmp_path: Path) -> None:
@@ -281,5 +279,4 @@ def test_a_history_of_another_user_is_named_with_its_owner(home: str) -> None:
     done = run(command, env)
     assert done.code == 3
     assert done.err.startswith(f"talk: no server found; tried:\n  {socket}")
-    owner = pwd.getpwuid(os.getuid()).pw_name
-    assert done.err.endswith(f"the history {path} belongs to {owner}, and you may not read it\n")
+    assert done.err.endswith(f"the history {path} can't be read: it belongs to uid {os.getuid()}\n")

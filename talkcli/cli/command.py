@@ -38,8 +38,8 @@ _NOT_A_TIME = {
     "ms": "must be a time in whole milliseconds, such as 300ms or 0.3s",
 }
 
-#: The words for a day, with the number of days before today.
-_DAYS_AGO = {"today": 0, "yesterday": 1}
+#: The words for a day, with the number of days before today. Without a word, it is today.
+_DAYS_AGO = {"": 0, "today": 0, "yesterday": 1}
 #: Options that can't be used with several robots.
 _SINGLE_ROBOT_OPTIONS = ("lines", "ahead", "stream", "feedback", "output", "list")
 
@@ -262,19 +262,16 @@ def _parse_moment(text: str) -> float:
     from datetime import datetime, timedelta  # rarely needed, and slow to import
 
     now = datetime.now()
-    words = text.split(" ")
+    day, _, clock = text.rpartition(" ") if ":" in text else (text or "?", "", "00:00")
     try:
         if text.endswith(("h", "m", "s")):
             return (now - timedelta(seconds=_parse_duration(text, "s"))).timestamp()
-        clock = words.pop() if ":" in words[-1] else "00:00"
-        day, *rest = words or ["today"]
         date = now - timedelta(_DAYS_AGO[day]) if day in _DAYS_AGO else datetime.strptime(day, "%Y-%m-%d")
-        form = "%H:%M:%S" if clock.count(":") > 1 else "%H:%M"
-        if not rest:
-            return datetime.combine(date, datetime.strptime(clock, form).time()).timestamp()
+        time = datetime.strptime(clock, "%H:%M:%S" if clock.count(":") > 1 else "%H:%M").time()
+        return datetime.combine(date, time).timestamp()
     except (LookupError, OverflowError, ValueError):
-        pass
-    raise ValueError(f"must be a time such as 2h, 14:00, yesterday or '2026-11-24 14:00', got '{text}'")
+        words = f"must be a time such as 2h, 14:00, yesterday or '2026-11-24 14:00', got '{text}'"
+        raise ValueError(words) from None
 
 
 def _parse_file_mode(text: str) -> int:

@@ -409,23 +409,18 @@ _ROWS = (
         summary="Show what was said, by whom, and how it ended.",
         function="log:log",
         description="""
-        Show the goals that have ended, including rejected goals. The newest goal is last. A sender is shown by the name
-        that it chose (in quotes), or else by the program that called talk.
+        Show the goals that have ended. The newest goal is last. A sender is shown by its own name (in quotes), or else
+        by the program that called talk.
 
-        With 'talk serve --history', goals from before the server's start are included. TIME is 14:00, yesterday,
-        '2026-11-24 14:00', or 2h (ago).
+        With 'talk serve --history', goals from before the server's start are included. By default, 20 goals are shown,
+        or 2,200 with a filter. TIME is 14:00, yesterday, '2026-11-24 14:00', or 2h (ago).
         """,
         examples="""
         talk log --since yesterday --until today --as patrol
         talk --json log --state aborted | jq -r .message
         """,
         options=(
-            option(
-                "-n, --count",
-                INTEGER,
-                f"Show the last N.  [default: 20; filtered: {MAX_LOG_GOALS}]",
-                limits=(1, MAX_LOG_GOALS),
-            ),
+            option("-n, --count", INTEGER, "Show the last N goals.", limits=(1, MAX_LOG_GOALS)),
             _LONG,
             *(each for each in goal_options.Log.options if each.flags),
         ),

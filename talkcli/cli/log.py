@@ -9,7 +9,7 @@ import os
 import time
 
 from talkcli.cli.show import note, screen, show_result
-from talkcli.errors import RequestRefused, ServerUnavailable, TalkError
+from talkcli.errors import AccessDenied, RequestRefused, ServerUnavailable, TalkError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import MAX_LOG_GOALS, Log
@@ -72,14 +72,13 @@ def _read_history(options: CommonOptions, request: Log, error: ServerUnavailable
     Raises:
         ServerUnavailable: there is no history, or it can't be read.
     """
-    owners = {path: owner for path in history_files(named_socket(options.socket)) if (owner := _find_owner(path))}
-    if not owners:
+    found = [each for each in history_files(named_socket(options.socket)) if _find_owner(each) is not None]
+    if not found:
         raise error
-    path = next((each for each in owners if os.access(each, os.R_OK)), None)
-    if path is None:
-        path, owner = next(iter(owners.items()))
-        raise ServerUnavailable(f"{error.message}\nthe history {path} belongs to {owner}, and you may not read it")
+    path = max(found, key=lambda each: os.access(each, os.R_OK))
     try:
+        if not os.access(path, os.R_OK):
+            raise AccessDenied(f"it belongs to uid {_find_owner(path)}")
         from talkcli.history.file import search
         from talkcli.history.rows import given_filters, row_to_json, sql_condition
 
@@ -92,20 +91,14 @@ def _read_history(options: CommonOptions, request: Log, error: ServerUnavailable
     return [Goal.from_json(row_to_json(row)) for row in rows]
 
 
-def _find_owner(path: str) -> str | None:
-    """Return the name of a file's owner, or None if there is no file.
+def _find_owner(path: str) -> int | None:
+    """Return the user id of a file's owner, or None if there is no file.
 
-    If a directory hides the file, return the name of the directory's owner.
+    If a directory hides the file, return the directory's owner.
     """
     try:
-        uid = os.stat(path).st_uid
+        return os.stat(path).st_uid
     except PermissionError:
-        uid = os.lstat(closed_directory(path) or "/").st_uid
+        return os.lstat(closed_directory(path) or "/").st_uid
     except OSError:
         return None
-    import pwd  # rarely needed, and slow to import
-
-    try:
-        return pwd.getpwuid(uid).pw_name
-    except KeyError:
-        return f"uid {uid}"

@@ -52,9 +52,8 @@ def serve(options: CommonOptions, print_unit: str | None, **given: Any) -> int:
 
     `given` contains all other options, by name.
     """
-    history = given["history"]
-    is_named = "/" in (history or "")
-    if is_named:
+    history = given["history"] or ""
+    if "/" in history:
         given["history"] = os.path.abspath(history)
     if given["sounds"]:
         given["sounds"] = os.path.abspath(given["sounds"])
@@ -63,7 +62,7 @@ def serve(options: CommonOptions, print_unit: str | None, **given: Any) -> int:
         if print_unit.startswith("system") and "socket_mode" not in options.typed:
             mode = 0o660
             words.append("--socket-mode=0660")
-        state = _STATE_DIRECTORY if history and not is_named else ""
+        state = _STATE_DIRECTORY if history and "/" not in history else ""
         return _print_unit(options, "serve", print_unit, given, words, mode=f"{mode:04o}", state=state)
     if given["sounds"] and not os.path.isdir(given["sounds"]):
         raise UsageError(f"--sounds: {printable(given['sounds'])} is not a directory")

@@ -285,15 +285,13 @@ def _judge_history(history: object) -> list[Finding]:
     """Check whether the server can write its history. Return one finding, or none without a history."""
     if not isinstance(history, dict):
         return []
-    path, error = history.get("path"), history.get("error")
+    path, error, replaced = (history.get(each) for each in ("path", "error", "replaced"))
     if error is None:
         texts = "" if history.get("with_text") else " without their texts"
-        replaced = f"; {history['replaced']}" if history.get("replaced") else ""
-        return [ok("history", f"goals are stored{texts} in {path}{replaced}")]
-    words = f"{path} can't be written: {error}; {history.get('unwritten')} goals wait in memory"
-    dropped = f", {history['dropped']} are lost" if history.get("dropped") else ""
+        return [ok("history", f"goals are stored{texts} in {path}{f'; {replaced}' if replaced else ''}")]
+    counts = f"{history.get('unwritten')} goals wait in memory, {history.get('dropped')} are lost"
     step = "free some space on its disk, and let the server's user write to the file; the server keeps trying"
-    return [warning("history", words + dropped, step)]
+    return [warning("history", f"can't write to {path}: {error}; {counts}", step)]
 
 
 def _judge_recent_goals(goals: Sequence[Goal], now: float, server: JsonObject) -> Finding:

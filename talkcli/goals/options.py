@@ -184,6 +184,9 @@ SECONDS = Kind("number", (int, float), "must be a number", "TIME", time_unit="s"
 MILLISECONDS = Kind("integer", (int,), "must be an integer", "TIME", time_unit="ms")
 #: A point in time in seconds since 1970 UTC. On the command line, it is written as in "yesterday 14:00".
 MOMENT = Kind("number", (int, float), "must be a number", "TIME", check=_moment_error)
+#: The name of a state in which a goal has ended.
+_END_STATE = Kind("string", (str,), "must be a string", "STATE", check=_end_state_error)
+_LOG_COUNT = Kind("integer", (int,), "must be an integer", "N", check=_log_count_error)
 #: The name of a client, which the client chose itself.
 SENDER_NAME = Kind("string", (str,), "must be a string", "NAME", check=_sender_name_error)
 DATA = Kind("object", (dict,), f"must be an object of at most {MAX_DATA_BYTES} bytes", check=_data_error)
@@ -743,53 +746,22 @@ class Log:
 
     kind: ClassVar[str] = "log"
     meaning: ClassVar[str] = (
-        "List the most recently ended goals, including REJECTED goals, oldest first. Each given field excludes the "
-        "goals that don't match it"
+        "List the most recently ended goals, including REJECTED goals, oldest first. Goals must match all given fields"
     )
     options: ClassVar[tuple[Option, ...]] = (
-        Option(
-            "count",
-            Kind("integer", (int,), "must be an integer", "N", check=_log_count_error),
-            "the maximum number of goals",
-            20,
-            form=f"1 to {MAX_LOG_GOALS:,}",
-        ),
+        Option("count", _LOG_COUNT, "the maximum number of goals", 20, form=f"1 to {MAX_LOG_GOALS:,}"),
         Option(
             "since",
             MOMENT,
-            "the goals that ended at this time or later, in seconds since 1970 UTC",
-            help="Show goals that ended at TIME or later.",
+            "goals that ended at this time (seconds since 1970) or later",
+            help="Show goals since TIME.",
         ),
-        Option("until", MOMENT, "the goals that ended before this time", help="Show goals that ended before TIME."),
-        Option(
-            "state",
-            Kind("string", (str,), "must be a string", "STATE", check=_end_state_error),
-            "the goals that ended in this state",
-            form=f"one of {', '.join(f'`{each}`' for each in END_STATES)}",
-            choices=END_STATES,
-            help="Show goals that ended in this state, such as ABORTED.",
-        ),
-        Option(
-            "name",
-            SENDER_NAME,
-            "the goals whose sender has this name",
-            form=f"1 to {MAX_SENDER_NAME_CHARS} characters",
-            special_flags="--as",
-            help="Show goals whose sender chose this name.",
-        ),
-        Option("key", WORD, "the goals with this key", help="Show goals with this key."),
-        Option(
-            "grep",
-            TEXT,
-            "the goals whose text contains these characters",
-            help="Show goals whose text contains TEXT, in the same case.",
-        ),
-        Option(
-            "history",
-            FLAG,
-            "also list the goals in the server's history, if it keeps one; see *The history* below",
-            default=False,
-        ),
+        Option("until", MOMENT, "goals that ended before this time", help="Show goals that ended before TIME."),
+        Option("state", _END_STATE, "goals with this end state", choices=END_STATES, help="Show goals in this state."),
+        Option("name", SENDER_NAME, "goals sent under this name", special_flags="--as", help="Show goals from NAME."),
+        Option("key", WORD, "goals with this key", help="Show goals with this key."),
+        Option("grep", TEXT, "goals whose text contains this", help="Show goals whose text contains TEXT (same case)."),
+        Option("history", FLAG, "also goals in the server's history; see *The history* below", default=False),
     )
     count: int = 20
     since: float | None = None

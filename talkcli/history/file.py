@@ -27,32 +27,28 @@ if TYPE_CHECKING:
 
 #: Goals that ended longer ago than this are deleted.
 MAX_AGE_S = 90 * 24 * 3600.0
-#: Maximum size of the goals and their indexes. The file never exceeds 64 MB together with its write-ahead log (WAL),
-#: which needs about 6 MB while goals are deleted.
+#: If the goals and their indexes are larger than this, the oldest goals are deleted. The file and its write-ahead log
+#: (WAL) need a few more megabytes while goals are written and deleted, but together at most 64 MB.
 MAX_CONTENT_BYTES = 56_000_000
-#: Maximum size of the WAL if another program reads the file for a long time, so that the WAL can't be emptied.
+#: Maximum size of the WAL. It can't be emptied while another program reads the file.
 MAX_WAL_BYTES = 7_000_000
-#: If the file is full, this part of the goals is deleted, oldest first.
-_DELETED_FRACTION = 20
 #: How long to wait while another process writes to the file.
 _LOCK_WAIT_S = 2.0
-#: With NORMAL, a crash of the server loses no written goal, and a power failure only the newest ones. The WAL is copied
-#: into the file after 256 pages of 4 KiB. Deleted texts are overwritten.
-_PRAGMAS = (
-    "journal_mode = WAL",
-    "synchronous = NORMAL",
-    "wal_autocheckpoint = 256",
-    f"journal_size_limit = {256 * 4096}",
-    "secure_delete = ON",
-)
-_DELETE_OLDEST = f"""
+#: With NORMAL, a crash of the server loses no written goal, and a power failure only the newest ones. Deleted texts are
+#: overwritten.
+_PRAGMAS = """
+PRAGMA journal_mode = WAL; PRAGMA synchronous = NORMAL; PRAGMA secure_delete = ON;
+PRAGMA wal_autocheckpoint = 256; PRAGMA journal_size_limit = 1048576;
+"""
+#: Deletes the oldest 5 % of the goals.
+_DELETE_OLDEST = """
 DELETE FROM goals WHERE number <=
-    (SELECT number FROM goals ORDER BY number LIMIT 1 OFFSET (SELECT count(*) / {_DELETED_FRACTION} FROM goals))
+    (SELECT number FROM goals ORDER BY number LIMIT 1 OFFSET (SELECT count(*) / 20 FROM goals))
 """
 _INSERT = f"INSERT INTO goals ({', '.join(COLUMNS)}) VALUES ({', '.join('?' * len(COLUMNS))})"
 #: SQLite's messages if the content of a file is invalid. Python 3.10 has no error codes.
 _DAMAGED = ("malformed", "not a database")
-#: How many steps of SQLite's virtual machine to execute between two checks of the time limit, which takes about 1 ms.
+#: Number of steps of a search between two checks of its time limit. They take about 1 ms.
 _STEPS_PER_CHECK = 100_000
 
 
@@ -61,7 +57,7 @@ class HistoryError(TalkError):
 
     code = "history_failed"
 
-    def __init__(self, error: sqlite3.Error | OSError, file: FileIdentity | None) -> None:
+    def __init__(self, error: Exception, file: FileIdentity | None) -> None:
         """Create the error.
 
         Args:
@@ -111,26 +107,25 @@ class HistoryWriter:
     def close(self) -> None:
         """Close the file if it is open. A transaction that has not been committed is rolled back."""
         connection, self._connection = self._connection, None
-        if connection:
-            with contextlib.suppress(sqlite3.Error):
+        with contextlib.suppress(sqlite3.Error):
+            if connection:
                 connection.close()
 
     def _write(self, goals: Sequence[Goal]) -> str | None:
         """Write goals, and delete old ones. If the file was removed, start a new one and return a message."""
         message = None
         if self._connection and _identity(self._path) != self._file:
-            self.close()  # before a new file is created, because this may remove the WAL
+            self.close()  # before a new file is created, because this removes the WAL
             message = f"{self._path} was removed or replaced, so a new history was started"
-        connection = self._connection = self._connection or self._open()
-        if _size(f"{self._path}-wal") > MAX_WAL_BYTES:
-            busy, *_ = connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
-            if busy:
-                raise sqlite3.OperationalError("another program has been reading the file for too long")
+        connection = self._connection or self._open()
+        wal = f"{self._path}-wal"
+        is_large = os.path.exists(wal) and os.path.getsize(wal) > MAX_WAL_BYTES
+        if is_large and connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()[0]:
+            raise OSError("another program has been reading the file for too long")
         connection.execute("BEGIN IMMEDIATE")
         connection.execute("DELETE FROM goals WHERE ended_at < ?", (time.time() - MAX_AGE_S,))
-        pages, free, page_bytes = (
-            connection.execute(f"PRAGMA {each}").fetchone()[0] for each in ("page_count", "freelist_count", "page_size")
-        )
+        sizes = [connection.execute(f"PRAGMA {each}") for each in ("page_count", "freelist_count", "page_size")]
+        pages, free, page_bytes = (each.fetchone()[0] for each in sizes)
         if (pages - free) * page_bytes > MAX_CONTENT_BYTES:
             connection.execute(_DELETE_OLDEST)
         # SQLite releases the interpreter after each row, so other threads needn't wait until all rows are converted.
@@ -145,17 +140,11 @@ class HistoryWriter:
             os.close(os.open(self._path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o600))
         status = os.lstat(self._path)
         if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid():
-            raise FileExistsError("it is not a regular file of the server's user")
+            raise OSError("it is not a regular file of the server's user")
         self._file = status.st_dev, status.st_ino
-        connection = sqlite3.connect(self._path, timeout=_LOCK_WAIT_S, isolation_level=None)
-        try:
-            for each in _PRAGMAS:
-                connection.execute(f"PRAGMA {each}")
-            connection.executescript(SCHEMA)
-        except BaseException:
-            connection.close()
-            raise
-        return connection
+        self._connection = sqlite3.connect(self._path, timeout=_LOCK_WAIT_S, isolation_level=None)
+        self._connection.executescript(_PRAGMAS + SCHEMA)
+        return self._connection
 
     def _start_anew(self, goals: Sequence[Goal]) -> str:
         """Rename a damaged file, and write goals to a new one. Return a message about this."""
@@ -180,29 +169,21 @@ def search(path: str, condition: str, values: Sequence[object], count: int, end:
     Raises:
         HistoryError: the file can't be read, or reading takes too long.
     """
-    file = _identity(path)
-    if file is None:
-        return []
     query = f"SELECT {', '.join(COLUMNS)} FROM goals WHERE {condition} ORDER BY number DESC LIMIT ?"
-
-    def run(mode: str) -> list[Row]:
+    file = _identity(path)
+    # SQLite can't create the index of the WAL if the disk is full or read-only. In that case, leave out the WAL.
+    for mode in ("mode=ro", "immutable=1") if file else ():
         uri = f"file:{quote(os.fsencode(path))}?{mode}"
-        with contextlib.closing(sqlite3.connect(uri, timeout=_LOCK_WAIT_S, uri=True)) as connection:
-            connection.set_progress_handler(lambda: time.monotonic() > end, _STEPS_PER_CHECK)
-            return connection.execute(query, (*values, count)).fetchall()[::-1]
-
-    try:
         try:
-            return run("mode=ro")
-        except sqlite3.OperationalError as error:
-            if "locked" in str(error) or time.monotonic() > end:
-                raise
-            # SQLite can't create the index of the WAL on a full or read-only disk. Read the file without the WAL.
-            return run("immutable=1")
-    except sqlite3.Error as error:
-        if time.monotonic() > end:
-            raise HistoryError(TimeoutError("the search took too long"), file) from error
-        raise HistoryError(error, file) from error
+            with contextlib.closing(sqlite3.connect(uri, timeout=_LOCK_WAIT_S, uri=True)) as connection:
+                connection.set_progress_handler(lambda: time.monotonic() > end, _STEPS_PER_CHECK)
+                return connection.execute(query, (*values, count)).fetchall()[::-1]
+        except sqlite3.Error as error:
+            if time.monotonic() > end:
+                raise HistoryError(TimeoutError("the search took too long"), file) from error
+            if mode == "immutable=1" or type(error) is sqlite3.DatabaseError or "locked" in str(error):
+                raise HistoryError(error, file) from error
+    return []
 
 
 def _identity(path: str) -> FileIdentity | None:
@@ -212,11 +193,3 @@ def _identity(path: str) -> FileIdentity | None:
     except FileNotFoundError:
         return None
     return status.st_dev, status.st_ino
-
-
-def _size(path: str) -> int:
-    """Return the size of a file in bytes, or 0 if there is no file."""
-    try:
-        return os.stat(path).st_size
-    except FileNotFoundError:
-        return 0

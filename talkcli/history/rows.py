@@ -55,16 +55,16 @@ def given_filters(log: Log) -> JsonObject:
     return {name: value for name in _FILTERS if (value := getattr(log, name, None)) is not None}
 
 
-def columns_of(goal: Goal) -> JsonObject:
+def filter_values(goal: Goal) -> JsonObject:
     """Return the values of a goal that filters need, by the names of their columns."""
-    name = None if goal.client is None else goal.client.name
-    named = {"id": goal.id, "state": goal.state.name, "name": name, "key": goal.key}
-    return {**named, "ended_at": goal.ended_at or 0.0, "text": goal.text or ""}
+    name = goal.client.name if goal.client else None
+    values = {"id": goal.id, "state": goal.state.name, "name": name, "key": goal.key}
+    return {**values, "ended_at": goal.ended_at or 0.0, "text": goal.text or ""}
 
 
-def matches(filters: Mapping[str, object], columns: Mapping[str, object]) -> bool:
-    """Return whether a goal with these values in its columns passes all filters."""
-    return all(_FILTERS[name][2](columns[_FILTERS[name][1]], value) for name, value in filters.items())
+def matches(filters: Mapping[str, object], values: Mapping[str, object]) -> bool:
+    """Return whether a goal with these `filter_values` passes all filters."""
+    return all(_FILTERS[name][2](values[_FILTERS[name][1]], wanted) for name, wanted in filters.items())
 
 
 def sql_condition(filters: Mapping[str, object]) -> tuple[str, list[object]]:
@@ -78,7 +78,7 @@ def to_row(goal: Goal) -> Row:
     other = {name: each for name, each in shown.items() if name not in _SEPARATE_FIELDS and each != _DEFAULTS[name]}
     if goal.spoken is not None and goal.text is not None:
         other["spoken"] = len(goal.spoken)  # it is the beginning of the text
-    columns = {**columns_of(goal), "text": goal.text, "other": encode(other).decode()}
+    columns = {**filter_values(goal), "text": goal.text, "other": encode(other).decode()}
     return tuple(_storable(columns[name]) for name in COLUMNS)
 
 

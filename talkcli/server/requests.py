@@ -451,31 +451,26 @@ class Requests:
             if not self._reserve_memory(pending):
                 raise RequestRefused("too many requests are waiting", Busy.code)
             rows = await history.search(pending, filters, request.count)
-            pending.answer(self._history_items(pending, rows), count=len(rows))
+            size = sum(map(row_chars, rows))
+            pending.connection.stream.adjust_held_bytes(size)
+            pending.answer(self._history_items(pending, rows, size), count=len(rows))
             return
         # Only the goals in memory have texts that the history doesn't store.
         records = self._scheduler.recent.latest(MAX_LOG_GOALS if filters else request.count, include_rejected=True)
-        records = [each for each in records if matches(filters, _filter_columns(each))][-request.count :]
+        records = [each for each in records if matches(filters, _filter_values(each))][-request.count :]
         pending.answer(_goal_items("goal", records), count=len(records))
 
-    def _history_items(self, pending: PendingRequest, rows: list[Row]) -> Iterator[JsonObject]:
-        """Return an object for each row of the history. Count the memory of the rows until they are sent.
+    def _history_items(self, pending: PendingRequest, rows: list[Row], size: int) -> Iterator[JsonObject]:
+        """Yield an object for each row of the history. Goals that are still in memory have their texts.
 
-        Goals that are still in memory are shown with their texts.
+        `size` is counted as held output until all objects are sent.
         """
-        stream, size = pending.connection.stream, sum(map(row_chars, rows))
-        stream.adjust_held_bytes(size)
-
-        def items() -> Iterator[JsonObject]:
-            for row in rows:
-                goal = row_to_json(row)
-                record = self._scheduler.find(str(goal["id"]))
-                if record and record.ended_at == goal["ended_at"]:
-                    goal = record.snapshot().to_json()
-                yield {"goal": goal}
-            stream.adjust_held_bytes(-size)
-
-        return items()
+        for row in rows:
+            goal = row_to_json(row)
+            record = self._scheduler.find(str(goal["id"]))
+            is_same = record is not None and record.ended_at == goal["ended_at"]
+            yield {"goal": record.snapshot().to_json() if record and is_same else goal}
+        pending.connection.stream.adjust_held_bytes(-size)
 
     async def _set(self, pending: PendingRequest, request: Set) -> None:
         """Check and change the server's settings, and reply with all settings."""
@@ -516,16 +511,11 @@ def _goal_items(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:
     return ({name: each.snapshot().to_json()} for each in records)
 
 
-def _filter_columns(record: Record) -> JsonObject:
+def _filter_values(record: Record) -> JsonObject:
     """Return the values of a goal in memory that the filters of `log` need."""
-    say, ended_at = record.say, record.ended_at or 0.0
-    return {
-        "ended_at": ended_at,
-        "state": record.state.name,
-        "name": record.sender.name,
-        "key": say.key,
-        "text": say.text,
-    }
+    say, state = record.say, record.state.name
+    values: JsonObject = {"state": state, "name": record.sender.name, "key": say.key, "text": say.text}
+    return {**values, "ended_at": record.ended_at or 0.0}
 
 
 def _memory_of(value: object) -> int:

@@ -10,7 +10,6 @@ import random
 import signal
 import string
 import time
-from typing import TYPE_CHECKING
 
 from talkcli import __version__, paths, peers
 from talkcli.daemon import log
@@ -23,16 +22,7 @@ from talkcli.engine.sounds import SoundLibrary
 from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError, UsageError, memory_hint
 from talkcli.frozen import frozen
 from talkcli.goals.goal import JsonObject, Sender
-from talkcli.goals.options import (
-    DEFAULTS,
-    MAX_TEXT_CHARS,
-    NO_TEXT_HISTORY,
-    TEXT_HISTORY,
-    Say,
-    Set,
-    is_neural,
-    shown_settings,
-)
+from talkcli.goals.options import DEFAULTS, MAX_TEXT_CHARS, NO_TEXT_HISTORY, Say, Set, is_neural, shown_settings
 from talkcli.goals.scheduler import Scheduler
 from talkcli.goals.voices import VoiceScheduler
 from talkcli.protocol.events import PROTOCOL, busy_greeting, greeting
@@ -44,9 +34,6 @@ from talkcli.server.speech import Speech
 from talkcli.server.stream import Acceptor, raise_descriptor_limit
 from talkcli.server.voices import VoiceCatalog
 
-if TYPE_CHECKING:
-    from talkcli.server.history import History
-
 #: Number of additional clients that a full server accepts. They can only ask for the status or cancel goals.
 MAX_EXTRA_CLIENTS = 16
 #: How often to check that clients can find the socket. A missing socket must be noticed within 30 s, and a check takes
@@ -56,8 +43,6 @@ SOCKET_CHECK_S = 10.0
 _CLIENT_CLOSE_S = 0.3
 #: How long the server waits for the engine process to exit.
 _ENGINE_CLOSE_S = 1.0
-#: Number of file descriptors that the history uses: three for each of its threads.
-_HISTORY_DESCRIPTORS = 6
 
 
 @frozen
@@ -79,7 +64,7 @@ class ServerSettings:
     sounds: str | None = None  # directory of sounds
     #: memory limit for neural voices in MB, enough for four voices of medium size
     voice_memory: int = 300
-    #: how to keep a history: TEXT_HISTORY, NO_TEXT_HISTORY, or the path of a file; None for no history
+    #: TEXT_HISTORY, NO_TEXT_HISTORY, or the path of a file with a "/"; None for no history
     history: str | None = None
     socket: str | None = None
     socket_mode: int = 0o600
@@ -134,7 +119,7 @@ class Server:
         self.speech.sounds = SoundLibrary(settings.sounds)
         self._systemd = ServiceManager(self._loop, self.speech.status_message)
         self.speech.on_status_change = self._systemd.schedule_status
-        self.speech.history = self._open_history()
+        self._open_history()
         self._requests = Requests(self.speech, self._describe)
         self.handle, self.is_waiting = self._requests.handle, self._requests.is_waiting
         self.input_ended = self._requests.input_ended
@@ -155,9 +140,7 @@ class Server:
     async def run(self) -> None:
         """Run the server until a signal stops it. If an error stops it, raise the error."""
         settings, speech = self._settings, self.speech
-        descriptors = raise_descriptor_limit(
-            settings.max_clients + MAX_EXTRA_CLIENTS + _HISTORY_DESCRIPTORS * bool(speech.history)
-        )
+        descriptors = raise_descriptor_limit(settings.max_clients + MAX_EXTRA_CLIENTS)
         self._acceptor = Acceptor(lambda each: ClientConnection(self, speech.streams, each).begin(), descriptors)
         self._loop.set_exception_handler(log.handle_loop_error)
         for number in self._end_signals:
@@ -209,26 +192,25 @@ class Server:
         if self._fatal_error:
             raise self._fatal_error
 
-    def _open_history(self) -> History | None:
-        """Open the configured history. Return None if there is none.
+    def _open_history(self) -> None:
+        """Open the configured history, if any.
 
         Raises:
             UsageError: this Python has no sqlite3.
         """
         where, player = self._settings.history, self._settings.player
         if where is None:
-            return None
-        is_named = where not in {TEXT_HISTORY, NO_TEXT_HISTORY}
-        if is_silent(player) and not is_named:
+            return
+        if is_silent(player) and "/" not in where:
             log.write(f"no history is kept, because the player {log.sanitize(player or '')} is silent")
-            return None
+            return
         try:
             from talkcli.server.history import History
         except ImportError as error:
             raise UsageError(f"--history needs the module sqlite3, which this Python lacks ({error})") from error
-        path, with_text = where if is_named else paths.history_file(self._listener.path), where != NO_TEXT_HISTORY
+        path, with_text = paths.history_file(where, self._listener.path), where != NO_TEXT_HISTORY
         log.write(log.sanitize(f"storing goals {'' if with_text else 'without their texts '}in {path}"))
-        return History(path, with_text=with_text)
+        self.speech.history = History(path, with_text=with_text)
 
     def _apply_configured_voice(self) -> str | None:
         """Apply the configured voice if it is neural. Otherwise, return it for the engine to check.

@@ -39,8 +39,8 @@ ACCEPTS_PER_TURN = 8
 #: File descriptors reserved for the server: nine to restart the engine while the old process still exists, two to bind
 #: the socket again, one to look up a client's process, and some to spare.
 RESERVED_DESCRIPTORS = 16
-#: File descriptors used by a server without clients: fourteen of its own, and two for libraries.
-OWN_DESCRIPTORS = 16
+#: File descriptors used by a server without clients: fourteen of its own, six for the history, and two for libraries.
+OWN_DESCRIPTORS = 22
 _TOO_FEW_DESCRIPTORS = (
     "the server has too few file descriptors for more clients; raise LimitNOFILE= of its unit, or ulimit -n before "
     "talk serve"

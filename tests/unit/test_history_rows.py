@@ -13,7 +13,7 @@ from talkcli.goals.states import EXIT_CODES, State
 from talkcli.history.rows import (
     COLUMNS,
     SCHEMA,
-    columns_of,
+    filter_values,
     given_filters,
     matches,
     row_to_json,
@@ -80,7 +80,7 @@ def test_sqlite_and_python_select_the_same_goals(ended: list[Goal], log: Log) ->
     found = database.execute(f"SELECT number FROM goals WHERE {condition} ORDER BY number", values).fetchall()
     database.close()
     assert [number - 1 for (number,) in found] == [
-        index for index, goal in enumerate(ended) if matches(filters, columns_of(goal))
+        index for index, goal in enumerate(ended) if matches(filters, filter_values(goal))
     ]
 
 
