@@ -358,6 +358,23 @@ def test_an_unknown_voice_cannot_be_set(untouched: Client) -> None:
     assert untouched.settings() == SETTINGS
 
 
+def test_speech_is_paused_while_a_block_runs(client: Client) -> None:
+    handle = client.say("never-ends")
+    for seconds, error in ((600, None), (20, None), (20, KeyError)):
+        with contextlib.suppress(KeyError), client.paused(*([] if seconds == 600 else [seconds])) as goal:
+            server = client.status().server
+            assert (goal and goal.id, server["paused"]) == (handle.id, True)
+            assert server["paused_until"] - server["paused_at"] == seconds  # type: ignore[operator]
+            if error:
+                raise error
+        while client.status().server["paused"]:  # the server learns of the end of a connection a little later
+            time.sleep(0.001)
+    with pytest.raises(UsageError, match=r"0\.1 to 86400"), client.paused(0):
+        pass
+    assert client.status().server["paused"] is False
+    handle.cancel()
+
+
 def test_pause_stops_speech_and_resume_continues_it(client: Client, scripted: Talk) -> None:
     assert client.resume() is None  # speech was not paused
     assert client.pause() is None  # nothing was being spoken

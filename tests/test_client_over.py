@@ -12,7 +12,7 @@ from talkcli import Client, State
 from talkcli.client.connection import Connection
 from talkcli.client.core import ServerInfo
 from talkcli.client.goal import GoalHandle, merged
-from talkcli.errors import Lost, ServerUnavailable
+from talkcli.errors import Lost, ServerUnavailable, UsageError
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Cancel, Log, Say
 from talkcli.protocol.events import PausedChanged, Result, StateChanged, from_json
@@ -131,6 +131,12 @@ def test_a_merged_stream_contains_each_pause_once(scripted: Scripted) -> None:
     scripted.listeners.publish(PausedChanged(False, None, None, 0.0, 9))
     later = [event for _, event in stream]
     assert [event.n for event in later if isinstance(event, PausedChanged)] == [9]
+
+
+def test_a_pause_cannot_end_with_the_program_over_a_broker(scripted: Scripted) -> None:
+    with pytest.raises(UsageError, match="over a broker"), Client.over(scripted).paused():
+        pass
+    assert scripted.requests == []
 
 
 def test_a_goal_and_a_watch_are_lost_if_the_connection_ends(scripted: Scripted) -> None:

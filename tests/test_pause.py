@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
+import signal
+import subprocess
+import sys
 import time
 from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.conformance.bareserve import TALK
 from tests.support.patched_serve import patched_serve
+from tests.support.screen import Terminal
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -52,7 +59,7 @@ def test_pause_and_resume_report_the_affected_goal(scripted: Talk, active: str) 
 def test_status_shows_the_paused_goal(scripted: Talk, active: str) -> None:
     scripted.run("pause")
     status = scripted.run("status").out
-    assert "paused   speech is paused; continue with: talk resume\n" in status
+    assert re.search(r"paused   speech is paused by \S+ since \S+; continue with: talk resume\n", status)
     assert f"now      {active.partition('-')[2]}  ACTIVE" in status
     assert ", paused, for " in status
     assert "state    ACTIVE, paused\n" in scripted.run("status", active).out
@@ -108,6 +115,83 @@ def test_each_unconfirmed_pause_fails_after_its_own_time_limit(make_talk: MakeTa
         assert time.monotonic() - asked_at >= 0.95 * limit
     talk.run("resume")
     talk.run("cancel")
+
+
+def paused_for(talk: Talk) -> float | None:
+    """Return the length of the current pause; None if speech is not paused."""
+    server = talk.request("status")["server"]
+    return float(server["paused_until"] - server["paused_at"]) if server["paused"] else None
+
+
+def test_a_pause_ends_after_the_time_of_for(scripted: Talk) -> None:
+    done = scripted.run("pause", "--for", "20m")
+    assert (done.code, paused_for(scripted)) == (0, 1200)
+    assert re.fullmatch(r"talk: speech is paused until \d\d:\d\d:\d\d; continue with: talk resume\n", done.err)
+    assert re.search(r"^paused   .* since \S+, until \S+;", scripted.run("status").out, re.MULTILINE)
+    assert scripted.run("resume").code == 0
+    assert scripted.run("pause", "--for", "100ms").code == 0
+    scripted.watcher.wait_until(lambda event: event["event"] == "paused" and event["n"] > 2 and not event["paused"])
+
+
+def test_a_command_runs_during_a_pause_and_its_exit_code_is_returned(scripted: Talk, tmp_path: Path) -> None:
+    status = f"{shlex.join(TALK)} --json status"
+    for options, seconds in (([], 600), (["--for", "20m"], 1200)):
+        done = scripted.run("pause", *options, "--while", "--", "sh", "-c", f"{status}; exit 5")
+        server = json.loads(done.out)["server"]
+        assert (done.code, server["paused_until"] - server["paused_at"], done.err) == (5, seconds, "")
+    for command, code, message in (
+        (["sh", "-c", "kill -9 $$"], 137, ""),
+        (["no\x1bne"], 127, r"talk: can't run 'no\x1bne': No such file or directory" + "\n"),
+        ([str(tmp_path)], 126, f"talk: can't run '{tmp_path}': Permission denied\n"),
+    ):
+        done = scripted.run("pause", "--while", "--", *command)
+        assert (done.code, done.out, done.err) == (code, "", message)
+    assert scripted.run("resume").code == 0
+    assert paused_for(scripted) is None
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_is_passed_on_to_the_command(scripted: Talk, number: int) -> None:
+    program = "trap 'echo caught; exit 9' INT TERM HUP; echo ready; for _ in $(seq 500); do sleep 0.01; done"
+    client = scripted.start("pause", "--while", "--", "sh", "-c", program)
+    assert client.stdout
+    assert client.stdout.readline() == "ready\n"
+    client.send_signal(number)
+    done = scripted.finish(client)
+    assert (done.code, done.out) == (9, "caught\n")
+
+
+def test_ctrl_c_reaches_the_command_once(scripted: Talk) -> None:
+    program = (
+        "import signal, time\n"
+        "caught = []\n"
+        "signal.signal(signal.SIGINT, lambda *_: caught.append(1))\n"
+        "print('ready', flush=True)\n"
+        "while not caught: time.sleep(0.01)\n"
+        "time.sleep(0.3)\n"
+        "print(f'caught {len(caught)}')\n"
+        "exit(4)\n"
+    )
+    terminal = Terminal([*TALK, "pause", "--while", "--", sys.executable, "-c", program], scripted.env)
+    try:
+        terminal.wait_until(lambda screen: "ready" in screen.lines)
+        terminal.type(b"\x03")
+        assert terminal.finish() == 4
+        assert "^Ccaught 1" in terminal.screen.lines
+    finally:
+        terminal.close()
+
+
+def test_a_killed_pause_command_ends_its_pause(scripted: Talk) -> None:
+    client = scripted.start("pause", "--while", "cat", stdin=subprocess.PIPE)
+    assert client.stdin
+    assert client.stdout
+    client.stdin.write("ready\n")
+    client.stdin.flush()
+    assert client.stdout.readline() == "ready\n"
+    client.kill()
+    scripted.watcher.wait_until(lambda event: event["event"] == "paused" and not event["paused"])
+    client.communicate()  # this also ends the program
 
 
 def test_pause_and_resume_succeed_if_nothing_is_being_spoken(make_talk: MakeTalk) -> None:

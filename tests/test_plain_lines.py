@@ -19,10 +19,10 @@ from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import CommonOptions
 from talkcli.client.calls import check, too_long
 from talkcli.client.connect import GREETING_START
-from talkcli.goals.options import FLAG, Cancel, Say
+from talkcli.goals.options import FLAG, Cancel, Pause, Say
 from talkcli.protocol import events
 from talkcli.protocol.lines import encode, request_to_json
-from talkcli.protocol.requests import Hello, Pause, Resume, Status
+from talkcli.protocol.requests import Hello, Resume, Status
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -190,8 +190,9 @@ def library_requests(parsed: plain.PlainCommand) -> tuple[Hello, Request]:
     if command == "cancel":
         given = parsed.given
         return hello, Cancel(given["ids"] or None, given["current"], given["before"], given["key"])
-    others: dict[str, Request] = {"status": Status(parsed.given.get("goal_id")), "pause": Pause(), "resume": Resume()}
-    return hello, others[command]
+    if command == "pause":
+        return hello, Pause(parsed.given["seconds"])
+    return hello, Status(parsed.given.get("goal_id")) if command == "status" else Resume()
 
 
 def library_messages(parsed: plain.PlainCommand) -> tuple[JsonObject, JsonObject]:
@@ -213,6 +214,7 @@ def test_any_text_is_sent_early_unchanged(text: str) -> None:
         *(["say", 'a "quoted" word'], ["say", "two\nlines"], ["say", "x", "--id", "a"], ["say", "x" * 10_000]),
         *(["play", "chirp"], ["play", "-w", "--volume", "0.5", "--key", "k", "no such sound"]),
         *(["cancel", "4k7f-12"], ["cancel", "--before", "x"], ["cancel", "--key", "k"], ["status", "4k7f-12"]),
+        ["pause", "--for", "2m"],
     ],
 )
 def test_a_request_that_only_the_server_checks_is_sent_early(line: list[str]) -> None:
@@ -227,7 +229,7 @@ def test_a_request_that_only_the_server_checks_is_sent_early(line: list[str]) ->
         *(["say", "x" * 10_001], ["say", "x", "--voice", "v" * 10_000], ["say", "x", "--as", "n" * 65]),
         *(["play", "--list"], ["say", "-"], ["say", "--lines"], ["say", "Gr\udcc3\udcbc"], ["wait"], ["log"]),
         *(["cancel", "12"], ["cancel", "a", "a"], ["cancel", "i" * 65], ["cancel", ""], ["cancel", "--before", "12"]),
-        *(["status", "12"], ["status", "i" * 65], ["cancel", "--key", "k" * 65]),
+        *(["status", "12"], ["status", "i" * 65], ["cancel", "--key", "k" * 65], ["pause", "--while", "--", "-x"]),
     ],
 )
 def test_a_request_that_the_library_may_change_or_refuse_is_not_sent_early(line: list[str]) -> None:

@@ -200,7 +200,7 @@ async def test_a_client_that_leaves_during_a_cancel_is_forgotten() -> None:
 @in_loop
 async def test_a_server_ends_only_after_answering_every_waiting_goal() -> None:
     server, one, count = Server(), Client(), 3 * subscribers._MAX_CALLS_PER_TURN
-    server.speech.scheduler.pause()
+    server.speech.scheduler.pause(Sender(), server.speech.advance_time())
     server.fill(1)
     for number in range(count):
         server.wait(one, f"{number}")
@@ -215,7 +215,7 @@ async def test_a_server_ends_only_after_answering_every_waiting_goal() -> None:
 async def test_a_request_during_shutdown_is_answered_before_the_server_ends() -> None:
     count = 3 * subscribers._MAX_CALLS_PER_TURN
     server, late = Server(count), Client()
-    server.speech.scheduler.pause()
+    server.speech.scheduler.pause(Sender(), server.speech.advance_time())
     server.fill(count)
     server.requests.shut_down()
     server.ask(late, Wait())

@@ -12,6 +12,7 @@ starts no thread. If a task is cancelled while it waits, nothing is cancelled on
 
 from __future__ import annotations
 
+from contextlib import asynccontextmanager, closing
 from functools import partial
 from inspect import signature
 from typing import TYPE_CHECKING
@@ -25,7 +26,7 @@ from talkcli.client.goal import GoalCalls, end_time
 from talkcli.client.saying import SayingCalls
 from talkcli.client.stream import StreamCalls
 from talkcli.errors import UsageError
-from talkcli.goals.options import SOUND
+from talkcli.goals.options import PAUSE_S, SOUND
 from talkcli.protocol.events import Result, WordHeard
 
 if TYPE_CHECKING:
@@ -179,6 +180,13 @@ class Client(ClientCalls):
     def stream(self, **options: Any) -> SpeechStream:
         """Return a stream that speaks a text while the text is being written."""
         return SpeechStream(self._connection, self._stream_request(**options))
+
+    @asynccontextmanager
+    async def paused(self, seconds: float = PAUSE_S) -> AsyncIterator[Goal | None]:
+        """Pause all speech until the block ends. The value of the context manager is the paused goal, if any."""
+        connection, goal = await self._pause_while_connected(seconds)
+        with closing(connection):
+            yield goal
 
     async def follow(self, ids: Iterable[str] | None = None, *, feedback: bool = False) -> list[GoalHandle]:
         """Subscribe to the events of goals. Return the goals' handles."""

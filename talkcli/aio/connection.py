@@ -183,6 +183,10 @@ class LoopConnection(Connection):
 class LoopSocketConnection(LoopConnection, ReconnectingConnection):
     """A connection over a Unix socket that reconnects after a break, and is run by the event loop."""
 
+    async def open_another(self) -> LoopSocketConnection:
+        """Open another connection to the same server, with the same name."""
+        return await connect_socket(self._named, self._name, self._patience)
+
 
 async def connect_socket(socket: str | None, name: str | None, patience_s: float) -> LoopSocketConnection:
     """Connect to a server. Return the connection.

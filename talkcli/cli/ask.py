@@ -17,8 +17,11 @@ from talkcli.cli.command import nearest
 from talkcli.cli.show import note, screen, show, show_json, show_result
 from talkcli.errors import EXIT_SIGPIPE, TalkError, UnknownGoal
 from talkcli.frozen import TYPE_CHECKING, fields
+from talkcli.goals.goal import read_seconds
+from talkcli.goals.options import PAUSE_S, Pause
 from talkcli.paths import named_robot
-from talkcli.protocol.events import Canceled, unfinished
+from talkcli.polling import run_blocking
+from talkcli.protocol.events import Canceled, goal_in, unfinished
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -107,19 +110,31 @@ def change(options: CommonOptions, **settings: Any) -> None:
     show_result(options, [found], lambda: [] if asked else setting_lines(found))
 
 
-def pause(options: CommonOptions) -> None:
-    """Pause speech, and report which goal is paused."""
+def pause(options: CommonOptions, seconds: float | None, while_connected: bool, command: tuple[str, ...]) -> int | None:
+    """Pause speech, and report which goal is paused. With `while_connected`, run a program during the pause.
+
+    Return the exit code of the program, if any.
+    """
     with options.connect() as client:
-        goal = client.pause()
+        if while_connected:
+            from talkcli.cli.program import run_program
+
+            with client.paused(seconds or PAUSE_S):
+                return run_program(command)
+        reply, _ = run_blocking(client._connection.request(Pause(seconds)))
+    from talkcli.terminal.goals import clock_time
     from talkcli.terminal.text import printable
 
+    goal, until = goal_in(reply), read_seconds(reply.get("paused_until"))
     heard = " ".join((goal.spoken or "").split()) if goal else ""
     if len(heard) > _PAUSED_TEXT_CHARS:
         end = heard[-_PAUSED_TEXT_CHARS:]
         heard = f"…{end.partition(' ')[2] or end}"
     place = f' after "{printable(heard)}"' if heard else ""
     words = f"goal {printable(goal.id)} is paused{place}" if goal else "speech is paused"
+    words += "" if until is None else f" until {clock_time(until)}"
     _report_pause(options, goal, paused=True, message=f"{words}; continue with: talk resume")
+    return None
 
 
 def resume(options: CommonOptions) -> None:

@@ -129,6 +129,8 @@ class Command:
         """Return an error message if the command can't be sent to the selected robots."""
         from talkcli.fleet.desk.request import Selection, selects_several
 
+        if values.get("while_connected"):
+            return "--while only works on this machine, because a broker can't tell when a program ends; use --for"
         if selects_several(selection):
             single = [f"--{each}" for each in _SINGLE_ROBOT_OPTIONS if values.get(each)]
             if single or not self.fleet_function:

@@ -19,7 +19,6 @@ from talkcli.goals.options import (
     INTEGER,
     MAX_LOG_GOALS,
     MAX_TEXT_CHARS,
-    MILLISECONDS,
     NO_TEXT_HISTORY,
     PATH,
     TEXT,
@@ -172,7 +171,7 @@ _SERVE_OPTIONS = (
     ),
     option(
         "--lead-in",
-        MILLISECONDS,
+        goal_options.MILLISECONDS,
         "Play silence, such as 300ms, if the output was idle. HDMI, USB and Bluetooth outputs then don't swallow the "
         "first word.",
         default=0,
@@ -215,6 +214,13 @@ def _serve_fault(values: Mapping[str, Any], _: frozenset[str]) -> str | None:
         return f"--history takes no-text or a path with a '/', such as ./{history}.db (got '{history}')"
     if player == "file:":
         return "--player file: needs a path, as in file:PATH.wav"
+    return None
+
+
+def _pause_fault(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
+    """Return an error message if `pause` has a COMMAND without --while, or the other way round."""
+    if given["while_connected"] != bool(given["command"]):
+        return "--while and COMMAND belong together, as in: talk pause --while -- ./listen.py"
     return None
 
 
@@ -434,9 +440,21 @@ _ROWS = (
         even an urgent one. Goals can still be sent and cancelled.
 
         The command returns when the robot is silent. If silence is not confirmed within 2 seconds, the exit code is 1.
+
+        With --while, the command runs COMMAND when the robot is silent, and returns its exit code (126 or 127: it can't
+        be run). The pause ends with COMMAND, or after 10 minutes or the TIME of --for. Speech continues when all pauses
+        have ended. 'talk resume' ends them all.
         """,
         fleet_function="several:pause",
-        examples="talk pause; listen_to_the_operator; talk resume",
+        examples="""
+        talk pause; listen_to_the_operator; talk resume
+        talk pause --for 20s
+        talk pause --while -- ./listen.py --language de
+        """,
+        options=goal_options.Pause.options,
+        argument=Option("command", TEXT, metavar="[COMMAND]..."),
+        unknown_option_hint="Put '--' before COMMAND: talk pause --while -- COMMAND",
+        rule=_pause_fault,
     ),
     Command(
         name="resume",

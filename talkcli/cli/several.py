@@ -19,9 +19,9 @@ from talkcli.cli.wait import CANCEL_TIMEOUT_S, seconds_left, timeout_error
 from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.errors import EXIT_DIFFER, EXIT_OK, EXIT_TIMEOUT, TalkError
 from talkcli.frozen import replace
-from talkcli.goals.options import SOUND, Cancel, Say, Set
+from talkcli.goals.options import SOUND, Cancel, Pause, Say, Set
 from talkcli.polling import Interrupted
-from talkcli.protocol.requests import Pause, Request, Resume, Status, Wait
+from talkcli.protocol.requests import Request, Resume, Status, Wait
 from talkcli.terminal.goals import describe_end, setting_lines
 from talkcli.terminal.text import printable
 
@@ -97,9 +97,9 @@ def change(options: CommonOptions, **settings: Any) -> int:
     return _send_request(options, Set(**settings))
 
 
-def pause(options: CommonOptions) -> int:
-    """Pause speech on each robot, and print the outcomes."""
-    return _send_request(options, Pause())
+def pause(options: CommonOptions, seconds: float | None, **_: Any) -> int:
+    """Pause speech on each robot, and print the outcomes. A broker supports none of the other options."""
+    return _send_request(options, Pause(seconds))
 
 
 def resume(options: CommonOptions) -> int:

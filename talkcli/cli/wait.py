@@ -65,7 +65,9 @@ class GoalReporter:
         if not self._options.json and not self.feedback.shows_events:
             show_if_possible(show, goal.id)
         if goal.speech_paused and not (pause_known or goal.state.terminal):
-            self.feedback.note("speech is paused; continue with: talk resume")
+            from talkcli.terminal.goals import describe_pause
+
+            self.feedback.note(f"{describe_pause(goal.pause)}; continue with: talk resume")
 
     def follow(self, goals: Sequence[GoalHandle], timeout: float | None) -> None:
         """Show the events of goals until they have ended.

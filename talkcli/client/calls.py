@@ -13,11 +13,11 @@ from talkcli.client.core import EventBuffer
 from talkcli.errors import Lost, UnknownGoal, UsageError
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.goal import Goal
-from talkcli.goals.options import MAX_ID_CHARS, MAX_IDS, Cancel, Log, Say, Set, bad_option, key_error
+from talkcli.goals.options import MAX_ID_CHARS, MAX_IDS, Cancel, Log, Pause, Say, Set, bad_option, key_error
 from talkcli.goals.states import State
 from talkcli.protocol.events import Canceled, ServerStatus, Snapshot, goal_in, goals
 from talkcli.protocol.lines import MAX_LINE_BYTES, request_line, request_to_json
-from talkcli.protocol.requests import Pause, Resume, Sounds, Status, Voices, Wait, Watch
+from talkcli.protocol.requests import Resume, Sounds, Status, Voices, Wait, Watch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable
@@ -156,15 +156,28 @@ class ClientCalls:
         settings = reply.get("settings")
         return settings if isinstance(settings, dict) else {}
 
-    async def pause(self) -> Goal | None:
+    async def pause(self, seconds: float | None = None) -> Goal | None:
         """Pause all speech, and wait until it has stopped. Return the paused goal, if any."""
-        return goal_in((await self._connection.request(Pause()))[0])
+        request = Pause(seconds)
+        check(request)
+        return goal_in((await self._connection.request(request))[0])
 
     async def resume(self) -> Goal | None:
         """Resume speech. Return the resumed goal, if any."""
         return goal_in((await self._connection.request(Resume()))[0])
 
     # -- calls that clients adapt, because their results depend on the client
+
+    async def _pause_while_connected(self, seconds: float) -> tuple[Connection, Goal | None]:
+        """Pause all speech over a new connection. Return the connection and the paused goal, if any."""
+        request = Pause(seconds, while_connected=True)
+        check(request)
+        connection = await self._connection.open_another()
+        try:
+            return connection, goal_in((await connection.request(request))[0])
+        except BaseException:
+            connection.close()
+            raise
 
     async def _say(
         self,
@@ -298,7 +311,7 @@ def batches(ids: Iterable[str]) -> list[tuple[str, ...]]:
     return [tuple(each) for each in groups]
 
 
-def check(request: Say | Set | Log) -> None:
+def check(request: Say | Set | Pause | Log) -> None:
     """Raise UsageError if an option of a request is invalid."""
     for option in request.options:
         try:

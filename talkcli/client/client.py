@@ -17,11 +17,12 @@ from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.client.connection import ReconnectingConnection
 from talkcli.client.goal import GoalHandle
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.goals.options import SOUND, STALL_S
+from talkcli.goals.options import PAUSE_S, SOUND, STALL_S
 from talkcli.polling import run_blocking
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable, Iterator
+    from contextlib import AbstractContextManager
     from typing import Any
 
     from talkcli.client.connection import Connection
@@ -376,13 +377,44 @@ class Client:
         """
         return run_blocking(self._calls.set(rate, volume, voice, pitch, preempt, ttl))
 
-    def pause(self) -> Goal | None:
+    def pause(self, seconds: float | None = None) -> Goal | None:
         """Pause all speech, and wait until it has stopped. Return the paused goal, if any.
 
         Return None if no goal was being spoken. Nothing is spoken until any client calls `resume`. Pausing twice is no
         error.
+
+        Args:
+            seconds: end the pause after this time, 0.1 to 86,400. None means no limit.
+
+        Raises:
+            UsageError: `seconds` is out of its range.
         """
-        return run_blocking(self._calls.pause())
+        return run_blocking(self._calls.pause(seconds))
+
+    def paused(self, seconds: float = PAUSE_S) -> AbstractContextManager[Goal | None]:
+        """Return a context manager that pauses all speech until its block ends. Its value is the paused goal, if any.
+
+            with talk.paused():
+                answer = listen()
+
+        The pause has a connection of its own, and ends with it: at the end of the block, or when the program dies, in
+        any way. Speech continues when all pauses have ended, or when any client calls `resume`.
+
+        Args:
+            seconds: end the pause after this time, 0.1 to 86,400, in case the program hangs.
+
+        Raises:
+            UsageError: `seconds` is out of its range, or this client uses a broker.
+        """
+        from contextlib import closing, contextmanager  # rarely needed, and slow to import
+
+        @contextmanager
+        def pause_in_block() -> Iterator[Goal | None]:
+            connection, goal = run_blocking(self._calls._pause_while_connected(seconds))
+            with closing(connection):
+                yield goal
+
+        return pause_in_block()
 
     def resume(self) -> Goal | None:
         """Resume speech. Return the resumed goal, if any.

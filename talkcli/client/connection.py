@@ -138,6 +138,13 @@ class Connection(ClientCore):
                 self._drop()
             self.changed.notify_all()
 
+    async def open_another(self) -> Connection:
+        """Open another connection to the same server.
+
+        Raises UsageError if a connection of this kind doesn't end with the program.
+        """
+        raise UsageError("over a broker, a pause can't end with the program; use pause(seconds=...) instead")
+
     async def request(self, request: Request, on_reply: OnReply | None = None) -> tuple[JsonObject, list[JsonObject]]:
         """Send a request, and wait for the answer. Return the reply and the items of its list.
 
@@ -376,7 +383,8 @@ class SocketConnection(Connection):
         """
         super().__init__(patience_s)
         self._interrupt = interrupt
-        self._hello_message = hello(checked_sender_name(name), urgent=urgent)
+        self._name = checked_sender_name(name)
+        self._hello_message = hello(self._name, urgent=urgent)
         self._named = paths.named_socket(socket)
         give_up = time.monotonic() + keep_trying_s
         if not (attempt and attempt.server):
@@ -392,6 +400,10 @@ class SocketConnection(Connection):
         self._sent_early = attempt.request_sent
         #: bytes received after the greeting. They are processed after the early request is registered.
         self._received_early = attempt.received
+
+    async def open_another(self) -> Connection:
+        """Open another connection to the same server, with the same name. The errors are those of `Client`."""
+        return SocketConnection(self._named, name=self._name, patience_s=self._patience)
 
     @property
     def listener_pid(self) -> int | None:  # type: ignore[override]

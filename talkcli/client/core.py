@@ -31,13 +31,13 @@ from talkcli.errors import (
 )
 from talkcli.frozen import TYPE_CHECKING, frozen, replace
 from talkcli.goals.goal import Goal, read_fields
-from talkcli.goals.options import Append, Say
+from talkcli.goals.options import Append, Pause, Say
 from talkcli.goals.states import State
 from talkcli.protocol import events
 from talkcli.protocol.events import PausedChanged, Result, ServerStatus, Snapshot, StateChanged, WordHeard, goals
 from talkcli.protocol.features import FEATURES, missing_features
 from talkcli.protocol.lines import FIRST_SEQ, LineSplitter, decode, request_line, request_to_json
-from talkcli.protocol.requests import Pause, Wait, Watch
+from talkcli.protocol.requests import Wait, Watch
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -196,6 +196,8 @@ class TrackedGoal:
         self.attached = False
         #: whether all speech is paused, as far as the client knows
         self.speech_paused = False
+        #: the fields of the server's reply that describe the pause, if speech was paused
+        self.pause: JsonObject = {}
         #: whether this client still adds text to the goal
         self._adds_text = False
         #: monotonic time at which the server began to send the goal's events, or None
@@ -215,6 +217,7 @@ class TrackedGoal:
         self.goal = Goal.from_json(reply.get("goal"))
         self.attached = reply.get("attached") is True
         self.speech_paused = reply.get("paused") is True
+        self.pause = {name: value for name, value in reply.items() if name.startswith("paused")}
         self._adds_text = self.goal.more
 
     def _listen_to(self, listeners: EventListeners, *, feedback: bool, now: float) -> None:

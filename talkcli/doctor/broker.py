@@ -30,6 +30,7 @@ from talkcli.fleet.link import LOGIN_LIMIT_S, MAX_RECEIVE_COUNT, REASON_NOT_AUTH
 from talkcli.fleet.payloads import Message, Presence
 from talkcli.frozen import replace
 from talkcli.polling import wait_ready
+from talkcli.terminal.goals import describe_pause
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
@@ -444,7 +445,7 @@ def judge_server_status(robot: str, server: JsonObject, response_s: float) -> Fi
     """Check the status of the robot's server. Return the finding."""
     words = f"{robot} answered in {response_s * 1000:.0f} ms: {summarize_server(server)}"
     if server.get("paused") is True:
-        return warning("bridge", f"speech is paused; {words}", f"talk --robot {robot} resume")
+        return warning("bridge", f"{describe_pause(server)}; {words}", f"talk --robot {robot} resume")
     if server.get("engine") not in WORKING_STATES:
         return warning("bridge", words, f"on {robot}, run: talk doctor")
     return ok("bridge", words)

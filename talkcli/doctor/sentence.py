@@ -19,6 +19,7 @@ from talkcli.goals.goal import message_details
 from talkcli.goals.reasons import Reason
 from talkcli.goals.states import State
 from talkcli.polling import Interrupted
+from talkcli.terminal.goals import describe_pause
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -105,7 +106,7 @@ def speak_by_server(client: Client, text: str, limit: float) -> SentenceResult:
         goal = client.say(text, preempt=False, ttl=0)
         try:
             if goal.speech_paused:
-                return SentenceResult(goal.cancel().state, "paused", "not spoken: speech is paused")
+                return SentenceResult(goal.cancel().state, "paused", f"not spoken: {describe_pause(goal.pause)}")
             result = _convert_ended_goal(goal.wait(limit))
             with contextlib.suppress(TalkError):  # the result is valid even if the server ends now
                 result = replace(result, player=client.status().server.get("player"))
@@ -127,7 +128,7 @@ def _cancel_late_goal(client: Client, goal: GoalHandle, limit: float) -> Sentenc
         return _convert_ended_goal(ended)
     pending = [each.id for each in before.pending]
     if before.server.get("paused") is True:
-        return SentenceResult(ended.state, "paused", "not spoken: speech is paused")
+        return SentenceResult(ended.state, "paused", f"not spoken: {describe_pause(before.server)}")
     if goal.id not in pending:
         return SentenceResult(
             ended.state, "late", f"the sentence was cancelled, because it had not ended after {limit:g} s"

@@ -19,12 +19,12 @@ from talkcli.doctor.sound import file_owner
 from talkcli.doctor.voice import WORKING_STATES
 from talkcli.errors import TalkError
 from talkcli.frozen import TYPE_CHECKING, fields, frozen
-from talkcli.goals.goal import message_details
-from talkcli.goals.options import describe_settings
+from talkcli.goals.goal import message_details, read_seconds
+from talkcli.goals.options import LONG_PAUSE_S, describe_settings
 from talkcli.goals.reasons import Reason
 from talkcli.goals.states import State
 from talkcli.paths import PLACE_ABSENT, PLACE_DIRECTORY, PLACE_FILE, PLACE_FORBIDDEN, PLACE_STALE
-from talkcli.terminal.goals import clock_time
+from talkcli.terminal.goals import clock_time, describe_pause
 
 if TYPE_CHECKING:
     from collections.abc import Container, Mapping, Sequence
@@ -242,14 +242,19 @@ def judge_server(server: JsonObject, log: Sequence[Goal], now: float) -> list[Fi
         now: the current time in seconds since 1970.
     """
     history = _judge_history(server.get("history"))
-    return [_judge_state(server), _judge_settings(server), *history, _judge_recent_goals(log, now, server)]
+    return [_judge_state(server, now), _judge_settings(server), *history, _judge_recent_goals(log, now, server)]
 
 
-def _judge_state(server: JsonObject) -> Finding:
+def _judge_state(server: JsonObject, now: float) -> Finding:
     """Check the server's state. Return the finding."""
     version, words = server.get("version"), summarize_server(server)
     if server.get("paused") is True:
-        return failure("server", f"speech is paused; {words}", "talk resume")
+        paused = f"{describe_pause(server)}; {words}"
+        if server.get("paused_until") is None:
+            return failure("server", paused, "talk resume")
+        if now - (read_seconds(server.get("paused_at")) or now) >= LONG_PAUSE_S:
+            return warning("server", paused, "talk resume")
+        words = paused
     if server.get("engine") not in WORKING_STATES:
         return warning("server", words, advise(Reason.ENGINE_FAILED, words))
     if version != __version__:

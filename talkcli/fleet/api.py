@@ -16,8 +16,8 @@ from talkcli.client.client import Client
 from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.fleet.broker import URL, from_environment, require_paho
 from talkcli.fleet.desk.request import Selection
-from talkcli.goals.options import Cancel, Say, Set
-from talkcli.protocol.requests import Pause, Request, Resume, Status, Wait
+from talkcli.goals.options import Cancel, Pause, Say, Set
+from talkcli.protocol.requests import Request, Resume, Status, Wait
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -128,9 +128,12 @@ class Fleet:
         """
         return self._send_request(to, Status())
 
-    def pause(self, to: str) -> FleetRequest:
-        """Pause speech on each robot until `resume` is called. Return the request."""
-        return self._send_request(to, Pause())
+    def pause(self, to: str, seconds: float | None = None) -> FleetRequest:
+        """Pause speech on each robot until `resume` is called. Return the request.
+
+        If `seconds` is given (0.1 to 86,400), the pause ends after this time.
+        """
+        return self._send_request(to, Pause(seconds))
 
     def resume(self, to: str) -> FleetRequest:
         """Resume paused speech on each robot. Return the request."""

@@ -42,6 +42,11 @@ MAX_TEXT_BYTES = 40_000
 GROWTH_FACTOR = 5
 #: How long a growing text waits for more text after it was spoken: the default, the minimum and the maximum.
 STALL_S, MIN_STALL_S, MAX_STALL_S = 5, 1, 60
+#: How long a pause lasts if it ends with its connection: the default limit, the minimum and the maximum. The limit ends
+#: the pause of a program that hangs.
+PAUSE_S, MIN_PAUSE_S, MAX_PAUSE_S = 600, 0.1, 86_400
+#: How long a pause may last until the doctor and the log warn about it.
+LONG_PAUSE_S = 600
 #: Highest priority. Every JSON parser can represent this number exactly.
 MAX_PRIORITY = 1_000_000
 #: Maximum length of a key, which is shown on one line.
@@ -675,6 +680,39 @@ class Set:
 
 
 @frozen
+class Pause:
+    """A request to pause all speech.
+
+    The reply comes when the speech has stopped. Without fields, the pause ends only when a client resumes speech.
+    """
+
+    kind: ClassVar[str] = "pause"
+    meaning: ClassVar[str] = "Pause all speech. Without fields, the pause lasts until a `resume`"
+    options: ClassVar[tuple[Option, ...]] = (
+        Option(
+            "seconds",
+            SECONDS,
+            "end the pause after this many seconds",
+            limits=(MIN_PAUSE_S, MAX_PAUSE_S),
+            unit=" s",
+            default_words=f"no limit; {PAUSE_S} with `while_connected`",
+            special_flags="--for",
+            help="End the pause after TIME, such as 20s.",
+        ),
+        Option(
+            "while_connected",
+            FLAG,
+            "end the pause when this connection ends",
+            default=False,
+            special_flags="--while",
+            help="Run COMMAND, and end the pause when it ends.",
+        ),
+    )
+    seconds: float | None = None
+    while_connected: bool = False
+
+
+@frozen
 class Cancel:
     """A request to cancel all goals, or only those that match at least one field.
 
@@ -783,14 +821,14 @@ def require_fields(data_class: type, options: Iterable[str]) -> None:
             raise TypeError(f"{data_class.__name__} has no field for the option {name!r}")
 
 
-for _request in (Say, Append, Set, Cancel, Log):
+for _request in (Say, Append, Set, Pause, Cancel, Log):
     require_fields(_request, (each.name for each in _request.options))
 
 #: Settings of a server that was started without options.
 DEFAULTS = Set(**{each.name: each.setting.initial for each in SETTINGS if each.setting})
 
 
-def bad_option(request: Say | Set | Log) -> str | None:
+def bad_option(request: Say | Set | Pause | Log) -> str | None:
     """Return an error message if a request has a value or combination that is not allowed."""
     if isinstance(request, Say) and request.flush and request.preempt is False:
         return "flush can't be combined with preempt false, because it always interrupts"

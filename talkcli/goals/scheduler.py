@@ -59,6 +59,31 @@ class StateChange:
     state: State
 
 
+@frozen
+class PauseChange:
+    """An effect that publishes that speech was paused or resumed."""
+
+    paused: bool
+    #: the goal that is being spoken, or None
+    record: Record | None
+    #: the client that paused or resumed speech, or whose pause has ended
+    client: Sender
+    #: whether speech is resumed because all pauses have ended
+    all_ended: bool = False
+
+
+@frozen
+class SpeechPause:
+    """A client's pause of all speech."""
+
+    client: Sender
+    #: the beginning and the end, in seconds since 1970 UTC. The end is None if only `resume` ends the pause.
+    at: float
+    until: float | None
+    #: monotonic time of the end, or inf
+    ends_at: float
+
+
 class Order(Enum):
     """A kind of order to the engine, such as to start or stop a goal.
 
@@ -85,7 +110,7 @@ class EngineOrder:
     order: Order
 
 
-Effect = StateChange | EngineOrder | VoiceLoadOrder | VoiceDropOrder | VoiceWarning
+Effect = StateChange | PauseChange | EngineOrder | VoiceLoadOrder | VoiceDropOrder | VoiceWarning
 
 
 @dataclass(slots=True)
@@ -135,6 +160,8 @@ class Scheduler:
         self.active: Record | None = None
         #: whether speech is paused
         self.paused = False
+        #: the pauses that end with a connection, by that connection. None is the key of the last one of all others.
+        self._pauses: dict[object, SpeechPause] = {}
         #: whether goals can start. If no engine can be started, they start and fail at once.
         self.has_engine = False
         #: goals with incomplete texts whose sender left, and the time at which they end if nobody continues them
@@ -355,27 +382,64 @@ class Scheduler:
             self._request_voice(voice, now)
         return self.tick(now)  # the next goal may not have to wait for its voice any more
 
-    def pause(self) -> list[Effect]:
-        """Pause the active goal, and start no other goal until `resume` is called. Return the effects."""
+    def pause(self, client: Sender, now: Now, seconds: float | None = None, connection: object = None) -> list[Effect]:
+        """Pause the active goal, and start no other goal until all pauses have ended. Return the effects.
+
+        Args:
+            client: the client that pauses speech.
+            now: the current time.
+            seconds: after this time, the pause ends. If it is None, only `resume` or the connection ends the pause.
+            connection: if it is given, the pause ends when `end_pause` is called with it. The pause replaces an earlier
+                one with the same connection.
+        """
+        until, ends_at = (None, inf) if seconds is None else (now.wall + seconds, now.monotonic + seconds)
+        earlier = self._pauses.get(connection)
+        if earlier is None or connection is not None or earlier.ends_at < ends_at:
+            self._pauses[connection] = SpeechPause(client, now.wall, until, ends_at)
         if self.paused:
             return []
         self.paused = True
         if self.active is None or self.active.state is not State.ACTIVE:
-            return []
+            return [PauseChange(True, None, client)]
         self.active.paused = True
         self.active.pause_count += 1
-        return [EngineOrder(self.active, Order.HOLD)]
+        return [PauseChange(True, self.active, client), EngineOrder(self.active, Order.HOLD)]
 
-    def resume(self, now: Now) -> list[Effect]:
-        """End the pause, and resume the paused goal or start the next one. Return the effects."""
+    def resume(self, client: Sender, now: Now, *, all_ended: bool = False) -> list[Effect]:
+        """End all pauses, and resume the paused goal or start the next one. Return the effects.
+
+        Args:
+            client: the client that resumes speech, or whose pause has ended.
+            now: the current time.
+            all_ended: whether speech is resumed because all pauses have ended.
+        """
         if not self.paused:
             return []
         self.paused = False
+        self._pauses.clear()
         if not (self.active and self.active.paused):
-            return self._start_next(now)
+            return [PauseChange(False, None, client, all_ended), *self._start_next(now)]
         self.active.paused = False
         self._reset_stall_limit(self.active, now)
-        return [EngineOrder(self.active, Order.RESUME)]
+        return [PauseChange(False, self.active, client, all_ended), EngineOrder(self.active, Order.RESUME)]
+
+    def end_pause(self, connection: object, now: Now) -> list[Effect]:
+        """End the pause that lasts as long as a connection, if there is one. Return the effects."""
+        ended = self._pauses.pop(connection, None)
+        return self._resume_if_all_ended(ended.client, now) if ended else []
+
+    @property
+    def last_pause(self) -> SpeechPause | None:
+        """The pause that ends last, or None if speech is not paused."""
+        return max(self._pauses.values(), key=lambda each: each.ends_at, default=None)
+
+    def _resume_if_all_ended(self, client: Sender, now: Now) -> list[Effect]:
+        """Resume speech if all pauses have ended. Return the effects.
+
+        `client` is the client of the pause that ended last.
+        """
+        last = self.last_pause
+        return [] if last and last.ends_at > now.monotonic else self.resume(client, now, all_ended=True)
 
     def shutdown(self, now: Now) -> list[Effect]:
         """End all pending goals, stop the active one, and reject new ones. Return the effects."""
@@ -571,26 +635,27 @@ class Scheduler:
 
         Return inf if there is no time limit.
         """
-        deadlines = (self._active_deadline(), self.pending.next_expiry(), self._next_attempt_time())
+        pause_end = self.last_pause.ends_at if self.last_pause else inf
+        deadlines = (self._active_deadline(), self.pending.next_expiry(), self._next_attempt_time(), pause_end)
         return min(*deadlines, *self._orphans.values())
 
     def tick(self, now: Now) -> list[Effect]:
         """End goals that are out of time, and start the next goal if possible. Return the effects.
 
-        Expired goals are recalled. If the active goal was stopped and did not become silent in time, it is aborted. The
-        next goal starts if it no longer has to wait for its voice.
+        Speech is resumed if all pauses have ended. Expired goals are recalled. If the active goal was stopped and did
+        not become silent in time, it is aborted. The next goal starts if it no longer has to wait for its voice.
         """
-        effects: list[Effect] = []
+        effects = self._resume_if_all_ended(self.last_pause.client, now) if self.last_pause else []
         record = self.active
         if record is not None and now.monotonic >= self._active_deadline():
             if record.stop_requested_at is None:
                 stalled = now.monotonic >= record.stalls_at
-                effects = self._stop(record, Reason.TEXT_STALLED if stalled else Reason.EXPIRED, None, now)
+                effects += self._stop(record, Reason.TEXT_STALLED if stalled else Reason.EXPIRED, None, now)
             else:
                 words = (
                     f"speech failed: the goal was stopped, but silence was not confirmed within {CONFIRM_SILENCE_S:g} s"
                 )
-                effects = [EngineOrder(record, Order.GIVE_UP)]
+                effects.append(EngineOrder(record, Order.GIVE_UP))
                 effects += self._end(record, State.ABORTED, Reason.NOT_SILENT, words, record.by, now)
         for each in [each for each, ends_at in self._orphans.items() if now.monotonic >= ends_at]:
             effects += self.break_off(each, now)

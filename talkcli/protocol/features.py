@@ -14,18 +14,21 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
 
 
-#: All features. Each has a name for error messages, and the field and the value of the requests that need it. Never
-#: remove a feature.
-FEATURES = {
+#: All features. Each has a name for error messages, and the field and the value of the requests that need it. The value
+#: None stands for any value. Never remove a feature.
+FEATURES: dict[str, tuple[str, str, object]] = {
     "append": ("growing texts", "more", True),
     "history": ("filters of the log", "history", True),
     "markdown": ("Markdown", "format", "markdown"),
     "sound": ("sounds", "format", "sound"),
     "sounds": ("lists of sounds", "request", "sounds"),
+    "timed_pauses": ("pauses that end", "seconds", None),
 }
 
 
 def missing_features(request: JsonObject, available: Collection[str]) -> list[str]:
     """Return the names of the features that a request needs and the server lacks."""
-    needed = (name for name, (_, field, value) in FEATURES.items() if request.get(field) == value)
+    needed = (
+        name for name, (_, field, value) in FEATURES.items() if field in request and value in (None, request[field])
+    )
     return [each for each in needed if each not in available]

@@ -1,7 +1,7 @@
 """The requests that a client can send, and how they are read from JSON.
 
 Rules for this file: it only defines the form of requests. The scheduler decides whether a goal is admitted. A request
-is a class with a row for each of its fields. The classes of `say`, `append`, `cancel`, `log` and `set` are in
+is a class with a row for each of its fields. The classes of `say`, `append`, `cancel`, `log`, `set` and `pause` are in
 `goals.options`. Fields may be added, but never renamed or given another meaning. A field without a row is refused and
 never ignored, because a client must know that a server doesn't support it. `meaning` is shown in the protocol's
 document.
@@ -22,6 +22,7 @@ from talkcli.goals.options import (
     Cancel,
     Log,
     Option,
+    Pause,
     Say,
     Set,
 )
@@ -104,15 +105,6 @@ class Watch:
 
     kind: ClassVar[str] = "watch"
     meaning: ClassVar[str] = "Return the current state, and then send the events of all goals"
-    options: ClassVar[tuple[Option, ...]] = ()
-
-
-@frozen
-class Pause:
-    """A request to pause all speech. The reply comes when the speech has stopped."""
-
-    kind: ClassVar[str] = "pause"
-    meaning: ClassVar[str] = "Pause all speech"
     options: ClassVar[tuple[Option, ...]] = ()
 
 

@@ -68,7 +68,10 @@ class Handler(Protocol):
         """Start to carry out a client's request, which may be answered later."""
 
     def input_ended(self, connection: ClientConnection) -> None:
-        """End a client's incomplete texts at the end of its input, unless others may continue them."""
+        """End a client's pause and its incomplete texts at the end of its input.
+
+        Others may continue some of the texts.
+        """
 
     def is_waiting(self, connection: ClientConnection) -> bool:
         """Return whether a client is still waiting for a reply or an event."""

@@ -18,13 +18,13 @@ from talkcli.errors import Busy, RequestRefused, UnknownGoal
 from talkcli.frozen import fields, replace
 from talkcli.goals import options
 from talkcli.goals.goal import By, JsonObject
-from talkcli.goals.options import MAX_LOG_GOALS, Append, Cancel, Log, Say, Set
+from talkcli.goals.options import MAX_LOG_GOALS, Append, Cancel, Log, Pause, Say, Set
 from talkcli.goals.reasons import Reason, Refusal
 from talkcli.goals.states import State
 from talkcli.history.rows import given_filters, matches, row_chars, row_to_json
 from talkcli.protocol.events import Result
 from talkcli.protocol.lines import encode
-from talkcli.protocol.requests import Pause, Request, Resume, Sounds, Status, Voices, Wait, Watch
+from talkcli.protocol.requests import Request, Resume, Sounds, Status, Voices, Wait, Watch
 from talkcli.server.connection import PendingRequest, resume_all
 from talkcli.server.speech import MAX_UNHEARD_CHARS, describe_sender, unheard_chars
 
@@ -91,10 +91,15 @@ class Requests:
         self.input_ended(connection)
 
     def input_ended(self, connection: ClientConnection) -> None:
-        """End a client's incomplete texts at the end of its input, unless others may continue them."""
+        """End a client's pause and its incomplete texts at the end of its input.
+
+        Others may continue some of the texts.
+        """
         for record in [record for record, producer in self._producers.items() if producer is connection]:
             del self._producers[record]
             self._speech.apply(self._scheduler.producer_left(record, self._speech.advance_time()))
+        if effects := self._scheduler.end_pause(connection, self._speech.advance_time()):
+            self._speech.apply(effects)
 
     def shut_down(self) -> None:
         """End all goals, including those that are not in the queue yet, and reject new ones."""
@@ -235,7 +240,7 @@ class Requests:
         now = speech.advance_time()
         say, refusal = self._check_goal(pending, say)
         record, effects = scheduler.submit(say, connection.client, now, refusal, pending.canceled_by, waited)
-        extra: JsonObject = {"paused": True} if scheduler.paused else {}
+        extra = speech.describe_pause() if scheduler.paused else {}
         attached = not effects  # the goal was sent before
         if attached:
             state = record.state
@@ -351,17 +356,17 @@ class Requests:
         else:
             pending.answer(goals, count=len(ended))
 
-    async def _pause(self, pending: PendingRequest, _: Pause) -> None:
+    async def _pause(self, pending: PendingRequest, request: Pause) -> None:
         """Pause speech, and reply when the active goal is silent.
 
-        Raises RequestRefused if that takes too long.
+        Raises RequestRefused if that takes too long, or if a field has an invalid value.
         """
-        speech, scheduler = self._speech, self._scheduler
-        speech.advance_time()
-        changed, effects, active = not scheduler.paused, scheduler.pause(), scheduler.active
-        if changed:
-            self._publish_pause(active if active and active.paused else None, pending)
-        speech.apply(effects)
+        speech, scheduler, connection = self._speech, self._scheduler, pending.connection
+        if words := options.bad_option(request):
+            raise RequestRefused(words, Reason.BAD_OPTION)
+        seconds = request.seconds or (options.PAUSE_S if request.while_connected else None)
+        owner = connection if request.while_connected else None
+        speech.apply(scheduler.pause(connection.client, speech.advance_time(), seconds, owner))
         active = scheduler.active
         if active and active is not speech.silent_goal:
             in_time = await pending.wait(speech.waiting_for_silence[active], PAUSE_ANSWER_S)
@@ -372,30 +377,11 @@ class Requests:
 
     async def _resume(self, pending: PendingRequest, _: Resume) -> None:
         """Resume speech, and reply with the resumed goal, if any."""
-        speech, scheduler = self._speech, self._scheduler
-        now = speech.advance_time()
-        changed, active = scheduler.paused, scheduler.active
+        now, active = self._speech.advance_time(), self._scheduler.active
         if active and active.state is not State.ACTIVE:
             active = None  # a goal that is being stopped can't be resumed
-        speech.silent_goal = None
-        effects = scheduler.resume(now)
-        if changed:
-            self._publish_pause(active, pending)
-        speech.apply(effects)
-        if active:
-            resume_all(speech.waiting_for_silence[active])  # requests that wait for silence can be answered now
+        self._speech.apply(self._scheduler.resume(pending.connection.client, now))
         self._answer_pause(pending, active)
-
-    def _publish_pause(self, active: Record | None, pending: PendingRequest) -> None:
-        """Publish and log that speech was paused or resumed.
-
-        `active` is the goal being spoken, if any.
-        """
-        paused, client = self._scheduler.paused, pending.connection.client
-        goal_id = active.id if active else None
-        publish = self._speech.subscribers.paused_changed
-        self._speech.notifications.add([partial(publish, goal_id, paused=paused, by=By(client=client), at=time.time())])
-        log.write(f"{'paused' if paused else 'resumed'} by {describe_sender(client)}")
 
     def _answer_pause(self, pending: PendingRequest, goal: Record | None) -> None:
         """Reply to a `pause` or `resume` request.
@@ -403,7 +389,7 @@ class Requests:
         The reply contains the goal unless it has ended.
         """
         shown = None if goal is None or goal.state.terminal else goal.snapshot().to_json()
-        pending.answer(paused=self._scheduler.paused, goal=shown)
+        pending.answer(goal=shown, **self._speech.describe_pause())
 
     async def _status(self, pending: PendingRequest, request: Status) -> None:
         """Reply with one goal, or with the state of the server and its goals."""

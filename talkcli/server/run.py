@@ -308,7 +308,7 @@ class Server:
             "audible": settings.audible,
             **shown_settings(scheduler.settings),
             "neural_voices": scheduler.voices.to_json(),
-            "paused": scheduler.paused,
+            **speech.describe_pause(),
             "pending": len(scheduler.pending),
             "max_queue": settings.max_queue,
             "clients": len(self.connections),

@@ -24,9 +24,17 @@ from talkcli.engine.voices import is_own_driver
 from talkcli.errors import TalkError, UsageError
 from talkcli.frozen import replace
 from talkcli.goals.goal import By, Output, Sender
-from talkcli.goals.options import DEFAULTS, ENGINE_OPTIONS, engine_options, is_neural, require_fields, without_speaker
+from talkcli.goals.options import (
+    DEFAULTS,
+    ENGINE_OPTIONS,
+    LONG_PAUSE_S,
+    engine_options,
+    is_neural,
+    require_fields,
+    without_speaker,
+)
 from talkcli.goals.reasons import Reason
-from talkcli.goals.scheduler import Effect, EngineOrder, Now, Order, StateChange
+from talkcli.goals.scheduler import Effect, EngineOrder, Now, Order, PauseChange, StateChange
 from talkcli.goals.states import State
 from talkcli.goals.voices import VoiceDropOrder, VoiceLoadOrder, VoiceWarning
 from talkcli.server.connection import resume_all
@@ -39,6 +47,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from talkcli.engine.parent.supervisor import Supervisor
+    from talkcli.goals.goal import JsonObject
     from talkcli.goals.record import Record
     from talkcli.goals.scheduler import Scheduler
     from talkcli.server.connection import ClientConnection, WaitingList
@@ -119,6 +128,8 @@ class Speech:
         self.notifications = Notifications(self.streams)
         self.notifications.on_done = self._finish_if_all_ended
         self._timer: asyncio.TimerHandle | None = None
+        #: the timer for a warning about a long pause
+        self._pause_timer: asyncio.TimerHandle | None = None
         #: requests that are waiting for a goal to become silent or to end
         self.waiting_for_silence: defaultdict[Record, WaitingList] = defaultdict(dict)
         #: `append` requests that are waiting until more of their goal's text has been heard
@@ -172,11 +183,15 @@ class Speech:
 
     def apply(self, effects: list[Effect]) -> None:
         """Carry out the scheduler's effects, starting with orders to the engine."""
-        changes, queue_changed, at = [], False, time.time()
+        changes, queue_changed, resumed, at = [], False, None, time.time()
         for effect in effects:
             if isinstance(effect, StateChange):
                 changes.append(partial(self._publish_change, effect.record, effect.state, at))
                 queue_changed = queue_changed or effect.state is not State.REJECTED
+                continue
+            if isinstance(effect, PauseChange):
+                changes.append(partial(self._publish_pause, effect, at))
+                resumed = None if effect.paused else effect.record
                 continue
             try:
                 self._carry_out(effect)
@@ -188,6 +203,9 @@ class Speech:
         self._announce_next()
         self._set_timer()
         self.on_status_change()
+        if resumed:
+            self.silent_goal = None
+            resume_all(self.waiting_for_silence[resumed])  # requests that wait for silence can be answered now
 
     def _carry_out(self, effect: EngineOrder | VoiceLoadOrder | VoiceDropOrder | VoiceWarning) -> None:
         """Give the engine an order, or log a warning about a voice."""
@@ -263,6 +281,34 @@ class Speech:
             _log_goal_end(record, monotonic_now() - record.began_at)
             resume_all(self.waiting_for_silence.pop(record, {}))
             resume_all(self.waiting_for_hearing.pop(record, {}))
+
+    def _publish_pause(self, change: PauseChange, at: float) -> None:
+        """Publish and log that speech was paused or resumed, and schedule a warning about a long pause."""
+        goal_id = change.record.id if change.record else None
+        self.subscribers.paused_changed(goal_id, paused=change.paused, by=By(client=change.client), at=at)
+        what = "paused" if change.paused else "resumed"
+        words = f"{what}, because all pauses have ended; the last one was" if change.all_ended else what
+        log.write(f"{words} by {describe_sender(change.client)}")
+        if self._pause_timer:
+            self._pause_timer.cancel()
+        self._pause_timer = self._loop.call_later(LONG_PAUSE_S, self._warn_of_pause) if change.paused else None
+
+    def _warn_of_pause(self) -> None:
+        """Log a warning if speech is still paused."""
+        self.advance_time()
+        if pause := self.scheduler.last_pause:
+            words = f"speech has been paused for {LONG_PAUSE_S / 60:g} minutes, last by {describe_sender(pause.client)}"
+            log.write(f"{words}; continue with: talk resume")
+
+    def describe_pause(self) -> JsonObject:
+        """Return the fields of a reply that say whether speech is paused, and by whom.
+
+        They describe the pause that ends last.
+        """
+        last = self.scheduler.last_pause
+        by = By(client=last.client).to_json() if last else None
+        found: JsonObject = {"paused": self.scheduler.paused, "paused_by": by}
+        return {**found, "paused_at": last and last.at, "paused_until": last and last.until}
 
     def _set_timer(self) -> None:
         """Set the timer for the scheduler's next time limit."""

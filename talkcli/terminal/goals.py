@@ -10,7 +10,7 @@ import re
 import time
 
 from talkcli.frozen import TYPE_CHECKING, replace
-from talkcli.goals.goal import message_details
+from talkcli.goals.goal import By, message_details, read_seconds
 from talkcli.goals.options import SOUND, format_number
 from talkcli.goals.states import State
 from talkcli.protocol.lines import encode
@@ -19,7 +19,7 @@ from talkcli.terminal.text import COLUMN_GAP, ELLIPSIS, TEXT_COLUMNS, Screen, fi
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from talkcli.goals.goal import By, Goal, JsonObject, Output, Sender
+    from talkcli.goals.goal import Goal, JsonObject, Output, Sender
     from talkcli.protocol.events import ServerStatus
 
 #: The maximum length of a text in a list of goals.
@@ -138,14 +138,23 @@ def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
         state, why = (found.get(each) for each in ("state", "why"))
         lines += wrap(printable(f"{voice} {state}{f': {why}' if why else ''}").split(" "), _pad_label("voice"), screen)
     if server.get("paused"):
-        paused = screen.coloured("speech is paused", State.PREEMPTING)
-        lines.append(f"{_pad_label('paused')}{paused}; continue with: talk resume")
+        words = screen.coloured(describe_pause(server, screen), State.PREEMPTING)
+        lines += wrap([f"{words};", "continue with: talk resume"], _pad_label("paused"), screen)
     active = [status.active] if status.active else []
     tables = (("now", active, "silent"), ("queue", status.pending, "nothing"), ("said", status.recent, "nothing"))
     id_width = max((width(screen.goal_id(goal.id)) for _, goals, _ in tables for goal in goals), default=0)
     for label, goals, without in tables:
         lines += _goal_table(label, goals, id_width, screen, now) if goals else [_pad_label(label) + without]
     return lines
+
+
+def describe_pause(status: JsonObject, screen: Screen | None = None) -> str:
+    """Say who paused speech, since when and until when, according to the server's status or a reply."""
+    by, at, until = By.from_json(status.get("paused_by")), status.get("paused_at"), status.get("paused_until")
+    parts = [f" by {sender_forms(by.client, screen or Screen())[0]}"] if by and by.client else []
+    parts += [f" since {clock_time(found)}"] if (found := read_seconds(at)) is not None else []
+    parts += [f", until {clock_time(found)}"] if (found := read_seconds(until)) is not None else []
+    return "".join(["speech is paused", *parts])
 
 
 def _pad_label(label: str) -> str:

@@ -130,6 +130,28 @@ async def test_saying_ends_its_goal_with_the_block(scripted: Talk) -> None:
 
 
 @in_loop
+async def test_speech_is_paused_while_a_block_runs(scripted: Talk) -> None:
+    async def pause_for_ever() -> None:
+        async with talk.paused(20):
+            paused.set()
+            await asyncio.sleep(PATIENCE)
+
+    async with Client(scripted.socket, name="patrol") as talk:
+        goal = await talk.say("never-ends")
+        async with talk.paused() as found:
+            server = (await talk.status()).server
+            assert (found and found.id, server["paused_by"]["client"]["name"]) == (goal.id, "patrol")  # type: ignore[index]
+            assert server["paused_until"] - server["paused_at"] == 600  # type: ignore[operator]
+        paused = asyncio.Event()
+        task = asyncio.create_task(pause_for_ever())
+        await paused.wait()
+        task.cancel()
+        while (await talk.status()).server["paused"]:  # noqa: ASYNC110 - the server hears of the end a little later
+            await asyncio.sleep(0.001)
+        await goal.cancel()
+
+
+@in_loop
 async def test_a_client_connects_when_it_is_told_to(scripted: Talk) -> None:
     talk = Client(scripted.socket)
     with pytest.raises(UsageError, match="not connected"):

@@ -24,7 +24,7 @@ TABLE = {
     "Client": {
         "awaited": "say play follow cancel status goal log voices sounds settings set pause resume close",
         "iterated": "events",
-        "entered": "stream saying",
+        "entered": "stream saying paused",
         "same": "path server_pid",
         "only asyncio": "connect",
         "only blocking": "over",
@@ -51,6 +51,7 @@ ERRORS: list[tuple[str, dict[str, Any], type[Exception], str]] = [
     ("goal", {"goal_id": "12"}, UnknownGoal, "-12"),
     ("log", {"count": 0}, UsageError, "'count' must be"),
     ("set", {"rate": 9}, UsageError, "the rate must be"),
+    ("pause", {"seconds": 0}, UsageError, r"0\.1 to 86400"),
     ("set", {"voice": "parrot"}, BadOption, "parrot"),
 ]
 #: Arguments of `Client` that are refused.

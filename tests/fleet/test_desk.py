@@ -70,6 +70,7 @@ def comparable(done: Finished) -> tuple[int, str, str]:
         ("--json set --rate 450", 0),
         ("set --voice nobody", 2),
         ("pause", 0),
+        ("--json pause --for 20s", 0),
         ("--json resume", 0),
         ("wait", 0),
         ("--json wait -f old", 0),

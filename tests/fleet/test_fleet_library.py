@@ -105,7 +105,7 @@ def test_the_goal_of_a_closed_request_is_still_spoken(fleet: Fleet, pair: RealRo
 def test_a_fleet_has_the_requests_of_a_client(fleet: Fleet, pair: RealRobots) -> None:
     to, goal = "@warehouse", "paused"
     request(pair, "say", id=goal, text=LONG, key="door")
-    paused = list(fleet.pause(to))
+    paused = list(fleet.pause(to, 60))
     assert results(paused) == alike("PAUSED")
     assert [outcome.goal and outcome.goal.id for outcome in paused] == [goal] * 2
     status = list(fleet.status(to))

@@ -43,7 +43,7 @@ COMMANDS: list[tuple[str, str, str, str, str]] = [
     ("say --wait --id {} hello", "nothing", "{}", "SUCCEEDED", "goal"),
     ("cancel {}", "waiting", "{}", "RECALLED", "goal"),
     ("status", "nothing", "-", "IDLE", "status"),
-    ("pause", "speaking", "{first}", "PAUSED", "paused"),
+    ("pause --for 60s", "speaking", "{first}", "PAUSED", "paused"),
     ("set --rate 150", "nothing", "-", "SET", "settings"),
 ]
 

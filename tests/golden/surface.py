@@ -52,7 +52,7 @@ ERRORS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("watch", ("", "now")),
     ("log", ("", "-n 0", "-n 2201")),
     ("set", ("", "--rate 5", "--ttl -1", "--preempt --no-preempt --rate x")),
-    ("pause", ("",)),
+    ("pause", ("", "now", "--while", "--while ls -l", "--while -- ls", "--for 25h", "--robot anna --while -- ls")),
     ("resume", ("",)),
     ("voices", ("", "--language ''")),
     ("serve", (

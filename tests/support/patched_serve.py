@@ -7,7 +7,7 @@ from pathlib import Path
 _PROGRAM = """
 import sys
 sys.path.insert(0, {root!r})
-from talkcli.server import connection, requests, subscribers
+from talkcli.server import connection, requests, speech, subscribers
 from tests.support import scripted_serve
 {assignments}
 scripted_serve.main()

@@ -9,7 +9,8 @@ Every other step is a verb:
     heard a; completed a; failed a; stopped a; deaf a   report this as the engine; * is the active goal
     cancel; cancel a b; cancel current before=c key=k
     wait 1; pass 1              let a second pass, with or without a tick
-    pause; resume; shutdown; lost; ready; unavailable; missing; room 2 (the places in the queue); set ttl=5 preempt=yes
+    pause; pause seconds=5; pause connection=x; gone x (the connection x ends); resume
+    shutdown; lost; ready; unavailable; missing; room 2 (the places in the queue); set ttl=5 preempt=yes
     loaded joe; unloadable joe; unloaded joe; measured joe 2; chosen a joe      report this about the voice piper/joe
 
 An outcome is "a ACTIVE; c b PENDING; d e RECALLED replaced by c", for example. It lists pending goals in the order of
@@ -163,8 +164,9 @@ class Robot:
     def _do(self, verb: str, words: list[str]) -> None:
         scheduler, word = self.scheduler, words[0] if words else ""
         step: Callable[[], object] = {
-            "pause": lambda: self.collect(scheduler.pause()),
-            "resume": lambda: self.collect(scheduler.resume(self.now)),
+            "pause": lambda: self.collect(scheduler.pause(DOOR, self.now, **options(words))),
+            "resume": lambda: self.collect(scheduler.resume(DOOR, self.now)),
+            "gone": lambda: self.collect(scheduler.end_pause(word, self.now)),
             "shutdown": lambda: self.collect(scheduler.shutdown(self.now)),
             "lost": lambda: self.collect(scheduler.engine_lost(self.now)),
             "ready": lambda: self.collect(scheduler.engine_ready(self.now)),

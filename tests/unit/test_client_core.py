@@ -27,11 +27,11 @@ from talkcli.errors import (
     UnknownGoal,
 )
 from talkcli.goals.goal import Goal
-from talkcli.goals.options import Append, Cancel, Say
+from talkcli.goals.options import Append, Cancel, Pause, Say
 from talkcli.goals.states import State
 from talkcli.protocol.events import PausedChanged, Result, Snapshot, StateChanged, TextAdded, TextMissing, WordHeard
 from talkcli.protocol.lines import decode, encode
-from talkcli.protocol.requests import Pause, Status, Wait
+from talkcli.protocol.requests import Status, Wait
 
 if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject

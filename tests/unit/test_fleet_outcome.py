@@ -27,9 +27,9 @@ from talkcli.fleet.desk.request import (
     reply_outcomes,
 )
 from talkcli.goals.goal import Goal
-from talkcli.goals.options import Cancel, Say, Set
+from talkcli.goals.options import Cancel, Pause, Say, Set
 from talkcli.goals.states import State
-from talkcli.protocol.requests import Pause, Resume, Status, Wait
+from talkcli.protocol.requests import Resume, Status, Wait
 
 if TYPE_CHECKING:
     from talkcli.protocol.requests import Request

@@ -22,7 +22,7 @@ from talkcli.fleet.bridge.policy import (
 from talkcli.fleet.payloads import Message
 from talkcli.frozen import replace
 from talkcli.goals.goal import Goal, Sender
-from talkcli.goals.options import MAX_SENDER_NAME_CHARS, Append, Cancel, Say, is_clients_id
+from talkcli.goals.options import MAX_SENDER_NAME_CHARS, Append, Cancel, Pause, Say, is_clients_id
 from talkcli.goals.states import State
 from talkcli.protocol.lines import MAX_LINE_BYTES
 from talkcli.protocol.requests import REQUEST_TYPES, Sounds
@@ -183,6 +183,12 @@ def test_text_may_be_added_wherever_sentences_are_allowed_even_late(stale: bool)
     assert refusal_code(refused) == "not_allowed"
     assert isinstance(refused, Refusal)
     assert "does not allow say requests" in refused.error.message
+
+
+def test_a_pause_cannot_end_with_a_connection_over_a_broker() -> None:
+    fields = {"request": "pause", "seconds": 5}
+    assert accepted(decide(request(fields))).request == Pause(5)
+    assert refusal_code(decide(request({**fields, "while_connected": True}))) == "bad_option"
 
 
 def test_a_stale_sentence_is_refused_but_a_stale_cancel_is_accepted() -> None:

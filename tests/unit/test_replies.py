@@ -9,6 +9,7 @@ import pytest
 from talkcli import __version__
 from talkcli.errors import BadRequest, Busy, ProtocolMismatch
 from talkcli.protocol.events import PROTOCOL, busy_greeting, check_greeting, failure, greeting, item, ok, take_seq
+from talkcli.protocol.features import FEATURES
 from talkcli.protocol.lines import decode, encode
 
 if TYPE_CHECKING:
@@ -17,8 +18,7 @@ if TYPE_CHECKING:
 
 def test_a_greeting_has_protocol_version_process_and_boot_id() -> None:
     message = greeting("1.2.3", 4711, "4k7f")
-    features = ["append", "history", "markdown", "sound", "sounds"]
-    assert message == {"talk": 1, "version": "1.2.3", "pid": 4711, "boot": "4k7f", "features": features}
+    assert message == {"talk": 1, "version": "1.2.3", "pid": 4711, "boot": "4k7f", "features": [*FEATURES]}
     assert PROTOCOL == 1
     check_greeting(decode(encode(message)))
     check_greeting({**message, "features": ["pause"], "new": {"a": 1}})

@@ -64,6 +64,7 @@ def script(seed: int, length: int = 40) -> list[str]:
         *[lambda: f"{pick(ENGINE)} *"] * 4,
         *[lambda: f"{pick(['wait', 'wait', 'pass'])} {pick(STEPS_S)}"] * 2,
         *[lambda: pick(["pause", "resume", "resume", "lost", "ready", "ready", "missing"])] * 2,
+        lambda: pick(["pause seconds=1", "pause connection=x", "pause connection=y seconds=2", "gone x", "gone y"]),
         lambda: f"{pick(['heard', 'completed', 'failed', 'stopped'])} {pick(IDS)}",
         lambda: f"append {pick(IDS)} text={pick('ab')} {pick(['', '', 'end', 'broken'])}",
         lambda: f"left {pick(IDS)}",

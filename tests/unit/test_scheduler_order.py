@@ -199,6 +199,49 @@ resume starts no expired goal
 shutdown ends a paused goal, too
     a; b; pause; shutdown; stopped a; resume  ->  a PREEMPTED shutdown; b RECALLED shutdown
 
+# pauses that end
+
+a pause ends after its time
+    a; pause seconds=5; wait 4.9; b; pause seconds=0.1; wait 0.1  ->  a ACTIVE; b PENDING
+a pause with a time does not end early
+    a; pause seconds=5; wait 4.9  ->  a ACTIVE paused
+the next goal starts when the pause ends
+    pause seconds=5; a; b; wait 5  ->  a ACTIVE; b PENDING
+a pause ends even if the tick is late
+    pause seconds=5; a; b ttl=1; pass 9; wait 0  ->  a ACTIVE; b RECALLED expired
+the pause of a connection ends with it
+    a; pause connection=x seconds=600; gone x  ->  a ACTIVE
+the pause of a connection has a limit
+    a; pause connection=x seconds=600; wait 600  ->  a ACTIVE
+a connection without a pause ends no pause
+    a; pause connection=x seconds=600; gone y  ->  a ACTIVE paused
+speech is paused while one of two listeners is left
+    a; pause connection=x seconds=600; pause connection=y seconds=600; gone x  ->  a ACTIVE paused
+speech goes on when both listeners are gone
+    a; pause connection=x seconds=600; pause connection=y seconds=600; gone x; gone y  ->  a ACTIVE
+a listener that is gone ends only its own pause
+    a; pause connection=x seconds=9; pause connection=y seconds=5; gone x; wait 4.9  ->  a ACTIVE paused
+speech goes on when one listener is gone and the other one's limit is over
+    a; pause connection=x seconds=9; pause connection=y seconds=5; wait 6; gone x  ->  a ACTIVE
+a connection can replace its limit
+    a; pause connection=x seconds=9; pause connection=x seconds=2; wait 2  ->  a ACTIVE
+a pause without a limit outlasts listeners and times
+    a; pause; pause connection=x seconds=600; pause seconds=5; gone x; wait 999  ->  a ACTIVE paused
+a pause without a limit follows one with a time
+    a; pause seconds=5; pause; wait 999  ->  a ACTIVE paused
+the longer of two times counts
+    a; pause seconds=9; pause seconds=5; wait 8.9  ->  a ACTIVE paused
+resume ends all pauses
+    a; pause; pause connection=x seconds=600; pause seconds=5; resume  ->  a ACTIVE
+a listener whose pause was ended by resume ends no later pause
+    a; pause connection=x seconds=600; resume; pause; gone x; wait 600  ->  a ACTIVE paused
+a time that was ended by resume ends no later pause
+    a; pause seconds=5; resume; pause; wait 5  ->  a ACTIVE paused
+pauses that were ended by resume prolong no later pause
+    a; pause; pause connection=x seconds=600; resume; pause seconds=5; wait 5  ->  a ACTIVE
+a goal that is being stopped stays so when a pause ends
+    a; b; pause seconds=1; cancel a; wait 1  ->  a PREEMPTING canceled by door; b PENDING
+
 # full queue
 
 a queue without places rejects every goal

@@ -37,13 +37,15 @@ CHECKSUMS = {
     "protocol-1-lead-in": "3f3263930adb3116d5329efa626e6eaefc47f16290d539d36e352152bc22067e",
     "protocol-1-log": "e6bff73cab3772ced91ee80a2fcfd19a7ee4229aa486dffe357b078973987d15",
     "protocol-1-markdown": "2f65ff7f254ecbd5789e58ac5fb504248d0b3ba2d6cd9b4b746a238dedbab871",
+    "protocol-1-pauses": "6eee345b7e2f430238e5e5cf765eeb0ca3fdc712e09dd0c70c8637c3ebcaf9b7",
     "protocol-1-sound": "c738e879bd95c96fc687f2ba98e39b3d6172bed1c61f06841cacbaddcc9fe078",
     "protocol-1-voice": "4053df5d6bb376af2403e923cb48468fdeb25a46323a63e47e472ab823ef457f",
 }
 #: Fields that depend on the server, the client or the run. Only their types are compared.
 VARIES = {
     "version", "pid", "uid", "command", "parent", "socket", "at", "n", "started_at", "queued_at", "ended_at", "uptime",
-    "time", "duration", "heard", "message", "clients", "engine", "driver", "synthesizer", "player",
+    "time", "duration", "heard", "message", "clients", "engine", "driver", "synthesizer", "player", "paused_at",
+    "paused_until",
 }  # fmt: skip
 #: Fields of `VARIES` that may also be null.
 MAY_BE_NULL = {"pid", "uid", "command", "parent", "duration", "synthesizer", "player"}

@@ -13,7 +13,7 @@ from talkcli.errors import BadRequest, LineTooLong, RequestRefused
 from talkcli.fleet import topics
 from talkcli.fleet.payloads import Message
 from talkcli.frozen import frozen, replace
-from talkcli.goals.options import MAX_SENDER_NAME_CHARS, Append, Say
+from talkcli.goals.options import MAX_SENDER_NAME_CHARS, Append, Pause, Say
 from talkcli.protocol.events import failure, take_seq
 from talkcli.protocol.lines import MAX_LINE_BYTES, decode, encode
 from talkcli.protocol.requests import REQUEST_TYPES, Sounds, read_request
@@ -166,13 +166,7 @@ class Policy:
             if not repeatable:
                 raise BadRequest(f"correlation data must have at most {MAX_CORRELATION_BYTES} bytes", "bad_field")
             request = read_request(fields)
-            needed = Say.kind if request.kind in ALLOWED_WITH_SAY else request.kind
-            if needed not in self._allow:
-                words = f"this robot's bridge does not allow {needed} requests; add {needed} to its --allow"
-                raise BadRequest(words, "not_allowed")
-            if isinstance(request, Say) and now - self.newest_echo_at > STALE_AFTER_S:
-                words = "the connection to the broker stalled; send the sentence again if it is still true"
-                raise BadRequest(words, STALE_CODE)
+            self._check_request(request, now)
         except BadRequest as error:
             line = encode(failure(seq, error.code, error.message))
             reply = None if reply_topic is None else Message(reply_topic, line, correlation=correlation)
@@ -180,6 +174,18 @@ class Policy:
         start_by = None if message.expiry is None else now + message.expiry
         size = 0 if kind == topics.PLAIN_CANCEL else len(message.payload)
         return RemoteRequest(user, reply_topic, seq, request, correlation, size, start_by)
+
+    def _check_request(self, request: Request, now: float) -> None:
+        """Raise BadRequest if the robot doesn't accept a request from the broker."""
+        needed = Say.kind if request.kind in ALLOWED_WITH_SAY else request.kind
+        if needed not in self._allow:
+            words = f"this robot's bridge does not allow {needed} requests; add {needed} to its --allow"
+            raise BadRequest(words, "not_allowed")
+        if isinstance(request, Pause) and request.while_connected:
+            raise BadRequest("over a broker, a pause can't end with the connection; use 'seconds'", "bad_option")
+        if isinstance(request, Say) and now - self.newest_echo_at > STALE_AFTER_S:
+            words = "the connection to the broker stalled; send the sentence again if it is still true"
+            raise BadRequest(words, STALE_CODE)
 
 
 def _parse_request_fields(kind: str, payload: bytes) -> JsonObject:

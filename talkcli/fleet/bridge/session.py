@@ -24,11 +24,11 @@ from talkcli.fleet.link import boottime
 from talkcli.fleet.payloads import Message
 from talkcli.frozen import replace
 from talkcli.goals.goal import By, Goal, Sender
-from talkcli.goals.options import SHOWN_OPTIONS, Append, Cancel, Log, Say, Set
+from talkcli.goals.options import SHOWN_OPTIONS, Append, Cancel, Log, Pause, Say, Set
 from talkcli.goals.states import State
 from talkcli.protocol.events import Result, StateChanged, failure, item, ok
 from talkcli.protocol.lines import MAX_LINE_BYTES, decode, encode
-from talkcli.protocol.requests import Hello, Pause, Resume, Status, Wait, Watch
+from talkcli.protocol.requests import Hello, Resume, Status, Wait, Watch
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -12,10 +12,10 @@ from talkcli.errors import EXIT_OK, Lost, ServerUnavailable, TalkError, UnknownG
 from talkcli.fleet import topics
 from talkcli.frozen import TYPE_CHECKING, frozen
 from talkcli.goals.goal import Goal, JsonObject
-from talkcli.goals.options import Cancel, Say, Set
+from talkcli.goals.options import Cancel, Pause, Say, Set
 from talkcli.goals.states import State
 from talkcli.protocol.events import Canceled, ServerStatus, goal_in
-from talkcli.protocol.requests import Pause, Request, Resume, Status
+from talkcli.protocol.requests import Request, Resume, Status
 
 if TYPE_CHECKING:
     from talkcli.fleet.payloads import Presence

@@ -31,11 +31,11 @@ from talkcli.fleet.desk.link import ABSENCE_LIMIT_S, DeskLink
 from talkcli.fleet.desk.request import NoServer, RobotOffline
 from talkcli.fleet.link import Link, boottime
 from talkcli.frozen import replace
-from talkcli.goals.options import Append, Cancel, Say, Set
+from talkcli.goals.options import Append, Cancel, Pause, Say, Set
 from talkcli.polling import wait_ready
 from talkcli.protocol.events import check_greeting
 from talkcli.protocol.lines import decode
-from talkcli.protocol.requests import Hello, Pause, Request, Resume, Wait
+from talkcli.protocol.requests import Hello, Request, Resume, Wait
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:

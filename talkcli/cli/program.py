@@ -1,0 +1,58 @@
+"""Runs the program of `talk pause --while`."""
+
+from __future__ import annotations
+
+import errno
+import signal
+import subprocess
+import sys
+
+from talkcli.errors import EXIT_SIGNAL, TalkError
+from talkcli.frozen import TYPE_CHECKING
+from talkcli.terminal.text import printable
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+#: Exit codes of a shell if a program is not found, or can't be started for another reason.
+_EXIT_NOT_FOUND, _EXIT_NOT_STARTED = 127, 126
+_FROM_TERMINAL = {signal.SIGINT, signal.SIGQUIT}
+_HANDLED_SIGNALS = {*_FROM_TERMINAL, signal.SIGTERM, signal.SIGHUP, signal.SIGCHLD}
+
+
+def run_program(command: Sequence[str]) -> int:
+    """Run a program until it ends, and pass on signals to it. Return its exit code, as in a shell.
+
+    Raises TalkError with the exit code 126 or 127 if the program can't be started. After this call, this process no
+    longer receives the signals.
+    """
+    signal.signal(signal.SIGCHLD, lambda *_: None)  # an ignored signal can't be waited for everywhere
+    unblocked = signal.pthread_sigmask(signal.SIG_BLOCK, _HANDLED_SIGNALS)
+    try:
+        process = subprocess.Popen(
+            command,
+            preexec_fn=lambda: signal.pthread_sigmask(signal.SIG_SETMASK, unblocked),  # noqa: PLW1509 - no threads
+        )
+    except OSError as error:
+        failed = TalkError(f"can't run '{printable(command[0])}': {error.strerror}")
+        failed.code = "not_started"
+        failed.exit_code = _EXIT_NOT_FOUND if error.errno == errno.ENOENT else _EXIT_NOT_STARTED
+        raise failed from None
+    while process.poll() is None:
+        number, by_system = _wait_for_signal()
+        if number != signal.SIGCHLD and not by_system:
+            process.send_signal(number)
+    code = process.returncode
+    return EXIT_SIGNAL - code if code < 0 else code
+
+
+def _wait_for_signal() -> tuple[int, bool]:
+    """Wait for a signal. Return its number, and whether the system sent it.
+
+    On Ctrl-C, the terminal also sends the signal to the program, so it must not be passed on.
+    """
+    if sys.platform == "darwin":  # the sender is unknown
+        number = signal.sigwait(_HANDLED_SIGNALS)
+        return number, number in _FROM_TERMINAL
+    received = signal.sigwaitinfo(_HANDLED_SIGNALS)
+    return received.si_signo, received.si_code > 0
