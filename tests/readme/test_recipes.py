@@ -12,7 +12,7 @@ import types
 from typing import TYPE_CHECKING, Any
 
 from tests.conformance.bareserve import TALK, serving
-from tests.readme.blocks import block, runs
+from tests.readme.blocks import block, commands, runs
 from tests.readme.shell import Shell, wait_until
 from tests.support.surroundings import short_directory
 from tests.support.wav import write_tone
@@ -145,6 +145,22 @@ def test_the_launch_file_starts_a_server(shell: Shell, monkeypatch: pytest.Monke
         with serving(env, command=[*TALK, *process.cmd[1:]]) as server:
             wait_until(lambda: '"ready"' in server.log)  # the greeting was spoken
             assert server.end(signal.SIGINT) == 0  # launch stops it this way
+
+
+@runs("Keep a history")
+def test_a_history_answers_after_a_restart(tmp_path: Path, make_talk: MakeTalk) -> None:
+    serve, *logs = commands("Keep a history")
+    assert serve == "talk serve --history &"
+    talk = make_talk("--history", scripted=True, env={"XDG_STATE_HOME": str(tmp_path / "state")})
+    for text, key in (("length=0 to the charger", "eta"), ("fail=audio_lost", "k")):
+        talk.run("say", "--wait", "--as", "patrol", "--key", key, text)
+    wait_until(lambda: talk.request("status")["server"]["history"]["unwritten"] == 0)
+    talk.stop()
+    talk.start_server()
+    with contextlib.closing(Shell(tmp_path, talk.env)) as shell:
+        done = [shell.run(line) for line in logs]
+    assert [(each.returncode, each.stderr) for each in done] == [(0, "")] * 4
+    assert [len(each.stdout.splitlines()) for each in done] == [0, 1, 1, 1]
 
 
 @runs("In simulation and CI")
