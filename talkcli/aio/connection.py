@@ -141,7 +141,7 @@ class LoopConnection(Connection):
         self.exchanges[exchange.number] = exchange
 
     def _run_soon(self) -> None:
-        """Run the connection in the next round of the loop, and watch no descriptor until then.
+        """Run the connection in the next round of the loop. Stop watching descriptors until then.
 
         Call this before a method that may open or close descriptors.
         """

@@ -115,7 +115,7 @@ def _input_fault(values: Mapping[str, Any], typed: frozenset[str]) -> str | None
 
 
 def _play_options() -> Iterator[Option]:
-    """Yield the options of `play`, which are those of `say` that a sound can have."""
+    """Yield the options of `play`: the options of `say` that make sense for a sound."""
     for each in _SAY_OPTIONS:
         if not each.speech_only and each.name not in _TEXT_OPTIONS:
             words = each.help.partition("  [env var with")[0].replace("it was spoken", "it was played")

@@ -183,14 +183,14 @@ def _matches(value: str, incomplete: str) -> bool:
 def goal_ids(options: CommonOptions, incomplete: str) -> Offers:
     """Return the ids of unfinished goals as completions."""
     status = _request_status(options)
-    return _offer_ids(unfinished(status), status, incomplete)
+    return _offer_ids(unfinished(status), status.server, incomplete)
 
 
 def known_ids(options: CommonOptions, incomplete: str) -> Offers:
     """Return the ids of unfinished and recent goals as completions."""
     with options.connect(COMPLETION_TIMEOUT_S) as client:
         status, ended = client.status(), client.log(_MAX_ENDED_GOALS, history=False)
-    return _offer_ids([*unfinished(status), *reversed(ended)], status, incomplete)
+    return _offer_ids([*unfinished(status), *reversed(ended)], status.server, incomplete)
 
 
 def keys(options: CommonOptions, _: str) -> Offers:
@@ -254,9 +254,9 @@ def _request_status(options: CommonOptions) -> ServerStatus:
         return client.status()
 
 
-def _offer_ids(goals: Iterable[Goal], status: ServerStatus, incomplete: str) -> Offers:
-    """Return the ids of goals as completions. Include short ids if digits were typed."""
-    own = f"{status.server.get('boot')}-" if incomplete.isascii() and incomplete.isdecimal() else ""
+def _offer_ids(goals: Iterable[Goal], server: JsonObject, incomplete: str) -> Offers:
+    """Return the ids of all given goals as completions. Add this server's short ids if digits were typed."""
+    own = f"{server.get('boot')}-" if incomplete.isascii() and incomplete.isdecimal() else ""
     return [(name, _goal_help(each)) for each in goals for name in dict.fromkeys((each.id.removeprefix(own), each.id))]
 
 

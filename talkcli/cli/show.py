@@ -42,7 +42,7 @@ _NO_BREAK_SPACE = "\0"
 
 
 class CommonOptions:
-    """The options common to all commands, with the command's connection and start time."""
+    """The options common to all commands. It opens connections, and knows when the command started."""
 
     socket: str | None = None
     robot: str | None = None

@@ -481,7 +481,7 @@ class LineSpeaker(InputSpeaker):
                 wait(time.monotonic(), interruptible=False)
 
     def _report_and_forget_goals(self) -> None:
-        """With --wait, report the goals' events and how they ended. Forget goals that have ended.
+        """With --wait, report the events and results of the goals. Forget goals that have ended.
 
         Events are reported in the order of the lines.
         """

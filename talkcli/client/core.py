@@ -767,7 +767,7 @@ class ClientCore:
                 self.queue(self._renew_line(exchange, now), exchange)
 
     def _renew_line(self, exchange: Exchange, now: float) -> bytes:
-        """Reduce the TTL of a waiting request by the time that it has waited. Return its line."""
+        """Reduce the TTL of a waiting request by its waiting time. Return the request as a line."""
         request = exchange.request
         if isinstance(request, Say) and request.ttl:
             exchange.request = replace(request, ttl=max(MIN_TTL_S, request.ttl - (now - exchange.heard_at)))

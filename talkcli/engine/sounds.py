@@ -81,7 +81,7 @@ class SoundLibrary:
     """The sounds that a server can play by their names."""
 
     def __init__(self, directory: str | None) -> None:
-        """Create a library of the built-in sounds and of the files in a directory, if there is one."""
+        """Create a library of the built-in sounds and, optionally, the files in a directory."""
         self._directory = directory
 
     def names(self) -> list[str]:
@@ -162,7 +162,7 @@ def _refuse(path: str, words: str) -> NoReturn:
 
 
 def _refuse_format(path: str, words: str) -> NoReturn:
-    """Raise SoundError for a file that has to be converted. The message contains the command for that."""
+    """Raise SoundError for a file in another format. The message names a command that converts it."""
     source, target = shlex.quote(path), shlex.quote(f"{os.path.splitext(path)[0]}.wav")
     command = f"ffmpeg -i {source} -ac 1 -ar 44100 "
     command += f"new.wav && mv new.wav {target}" if source == target else target

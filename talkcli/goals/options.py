@@ -635,7 +635,7 @@ class Say:
 
     @property
     def content(self) -> str:
-        """The text, with a mark in front of the name of a sound, because a text may be the same as a name."""
+        """The text, or the name of a sound with a mark in front that distinguishes it from a text."""
         return f"\0{self.text}" if self.is_sound else self.text
 
 

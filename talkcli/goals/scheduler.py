@@ -899,7 +899,7 @@ class Scheduler:
         record.stalls_at = now.monotonic + record.say.stall if record.waits and record.more else inf
 
     def _require_active(self, goal_id: str) -> Record:
-        """Return the active goal. Raise IllegalTransition if it has another id."""
+        """Return the active goal. Raise IllegalTransition if its id isn't `goal_id`."""
         if self.active is None or self.active.id != goal_id:
             raise IllegalTransition(f"goal {goal_id} is not being spoken")
         return self.active

@@ -274,7 +274,7 @@ class Server:
             self._no_clients.clear()
 
     def left(self, connection: ClientConnection) -> None:
-        """Remove a client with its requests, and admit the next waiting client.
+        """Remove a client and its requests, and admit the next waiting client.
 
         The goals of the removed client continue.
         """

@@ -501,7 +501,7 @@ class Playback:
     def _release_and_rewind(self, feed: PlayerFeed) -> None:
         """Kill a player. Rewind the sentence to the first sound that may be unheard."""
         feed.record_progress(time.monotonic(), all_written=False)
-        self._release_and_continue_at(self._unheard_begin() if feed.player.proven else self._begin)
+        self._release_and_continue_at(self._find_unheard_offset() if feed.player.proven else self._begin)
 
     # -- steps
 
@@ -630,7 +630,7 @@ class Playback:
         if feed.consumed:
             began_at = now - self._clock.elapsed(now)
             self._players.handovers.sentence_started(player.name, began_at, neural=self._in_background)
-        self._samples.drop_until(self._unheard_begin() if player.real_time else self._sent)
+        self._samples.drop_until(self._find_unheard_offset() if player.real_time else self._sent)
         self._report_words(self._clock.pop_started(now) if player.real_time else self._clock.pop_all())
 
     def _report_words(self, words: list[TimedWord]) -> None:
@@ -638,8 +638,8 @@ class Playback:
         for word in words:
             self._on_word(replace(word, position=word.position - self._seconds(self._skipped)))
 
-    def _unheard_begin(self) -> int:
-        """Return the offset of the first sample that may not have been heard."""
+    def _find_unheard_offset(self) -> int:
+        """Return the offset in bytes, from the sentence's start, of the first sound that may be unheard."""
         heard = self._clock.heard_position(time.monotonic()) - REPEATED_SOUND_S
         return min(self._sent, max(self._begin, self._samples.begin, int(max(0.0, heard) * self._rate) * SAMPLE_BYTES))
 

@@ -30,7 +30,7 @@ _PIECE_S = 0.05
 _PAUSE_S = 0.26
 #: Loudness of the built-in sounds, which is about that of speech.
 _TONE_LEVEL = 11_000
-#: Share of the octave in a tone, which makes the tone audible on small loudspeakers.
+#: Volume of the octave that is mixed into a tone, to make the tone audible on small loudspeakers.
 _OCTAVE_LEVEL = 0.3
 #: How long a tone takes to become loud. Without this, a click would be heard.
 _ATTACK_S = 0.008

@@ -171,7 +171,7 @@ class EngineProcess:
             kill_holders(self.liveness)
 
     def reap(self) -> str:
-        """Wait briefly for the process to exit, or kill it. Return a description of how it exited."""
+        """Wait briefly for the process to exit, and kill it if it doesn't. Return how it exited."""
         wait_ready({self.liveness: select.POLLIN}, _EXIT_WAIT_S)  # macOS doesn't report a closed end without POLLIN
         self.kill()  # must happen before the process is reaped, because its group ID may be reused afterwards
         try:

@@ -314,7 +314,7 @@ class EspeakPhonemizer:
         self._to_phonemes.restype = ctypes.c_char_p
 
     def clauses(self, text: str) -> list[tuple[str, str]]:
-        """Split a text into clauses. Return each clause with its phonemes in IPA."""
+        """Split a text into clauses. Return pairs of a clause's text and its phonemes in IPA."""
         # The next calls treat phonemes as the last call of `Synth` did, so speak a blank with the right flags.
         self._speak_silently(" ")
         # The library reads ahead, and any other call discards that text. So get all clauses before doing anything else.
