@@ -214,7 +214,6 @@ def test_any_text_is_sent_early_unchanged(text: str) -> None:
         *(["say", 'a "quoted" word'], ["say", "two\nlines"], ["say", "x", "--id", "a"], ["say", "x" * 10_000]),
         *(["play", "chirp"], ["play", "-w", "--volume", "0.5", "--key", "k", "no such sound"]),
         *(["cancel", "4k7f-12"], ["cancel", "--before", "x"], ["cancel", "--key", "k"], ["status", "4k7f-12"]),
-        ["pause", "--for", "2m"],
     ],
 )
 def test_a_request_that_only_the_server_checks_is_sent_early(line: list[str]) -> None:
@@ -229,7 +228,8 @@ def test_a_request_that_only_the_server_checks_is_sent_early(line: list[str]) ->
         *(["say", "x" * 10_001], ["say", "x", "--voice", "v" * 10_000], ["say", "x", "--as", "n" * 65]),
         *(["play", "--list"], ["say", "-"], ["say", "--lines"], ["say", "Gr\udcc3\udcbc"], ["wait"], ["log"]),
         *(["cancel", "12"], ["cancel", "a", "a"], ["cancel", "i" * 65], ["cancel", ""], ["cancel", "--before", "12"]),
-        *(["status", "12"], ["status", "i" * 65], ["cancel", "--key", "k" * 65], ["pause", "--while", "--", "-x"]),
+        *(["status", "12"], ["status", "i" * 65], ["cancel", "--key", "k" * 65], ["pause", "--for", "2m"]),
+        ["pause", "--while", "--", "-x"],
     ],
 )
 def test_a_request_that_the_library_may_change_or_refuse_is_not_sent_early(line: list[str]) -> None:

@@ -17,16 +17,7 @@ from talkcli.cli.command import COMMON_OPTIONS, OUTPUT_FILE, read_value
 from talkcli.cli.commands import COMMANDS
 from talkcli.client.connect import hello, reach, send_early, sender_name, yield_processor
 from talkcli.frozen import TYPE_CHECKING, frozen
-from talkcli.goals.options import (
-    MAX_ID_CHARS,
-    MAX_SENDER_NAME_CHARS,
-    MAX_TEXT_CHARS,
-    SOUND,
-    Cancel,
-    Pause,
-    Say,
-    key_error,
-)
+from talkcli.goals.options import MAX_ID_CHARS, MAX_SENDER_NAME_CHARS, MAX_TEXT_CHARS, SOUND, Cancel, Say, key_error
 from talkcli.paths import named_robot, named_socket
 
 if TYPE_CHECKING:
@@ -212,8 +203,8 @@ def _early_request(command: str, given: dict[str, Any]) -> JsonObject | None:
         if len(ids) > 1 or not all(map(_is_full_id, [*ids, before or "-"])) or (key and key_error(key)):
             return None
         return request_to_json(Cancel(ids or None, given["current"], before, key))
-    if command == "pause":
-        return None if given["while_connected"] else request_to_json(Pause(given["seconds"]))
+    if given.get("seconds") or given.get("while_connected"):
+        return None
     goal_id = given.get("goal_id")
     if goal_id is None:
         return {"request": command}

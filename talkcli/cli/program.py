@@ -6,6 +6,7 @@ import errno
 import signal
 import subprocess
 import sys
+from functools import partial
 
 from talkcli.errors import EXIT_SIGNAL, TalkError
 from talkcli.frozen import TYPE_CHECKING
@@ -28,11 +29,9 @@ def run_program(command: Sequence[str]) -> int:
     """
     signal.signal(signal.SIGCHLD, lambda *_: None)  # an ignored signal can't be waited for everywhere
     unblocked = signal.pthread_sigmask(signal.SIG_BLOCK, _HANDLED_SIGNALS)
+    unblock = partial(signal.pthread_sigmask, signal.SIG_SETMASK, unblocked)
     try:
-        process = subprocess.Popen(
-            command,
-            preexec_fn=lambda: signal.pthread_sigmask(signal.SIG_SETMASK, unblocked),  # noqa: PLW1509 - no threads
-        )
+        process = subprocess.Popen(command, preexec_fn=unblock)  # noqa: PLW1509 - this process has no threads
     except OSError as error:
         failed = TalkError(f"can't run '{printable(command[0])}': {error.strerror}")
         failed.code = "not_started"

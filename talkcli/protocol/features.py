@@ -28,7 +28,5 @@ FEATURES: dict[str, tuple[str, str, object]] = {
 
 def missing_features(request: JsonObject, available: Collection[str]) -> list[str]:
     """Return the names of the features that a request needs and the server lacks."""
-    needed = (
-        name for name, (_, field, value) in FEATURES.items() if field in request and value in (None, request[field])
-    )
+    needed = (name for name, (_, key, value) in FEATURES.items() if key in request and value in (None, request[key]))
     return [each for each in needed if each not in available]

@@ -23,16 +23,9 @@ from talkcli.engine.sounds import SoundLibrary
 from talkcli.engine.voices import is_own_driver
 from talkcli.errors import TalkError, UsageError
 from talkcli.frozen import replace
+from talkcli.goals import options as goal_options
 from talkcli.goals.goal import By, Output, Sender
-from talkcli.goals.options import (
-    DEFAULTS,
-    ENGINE_OPTIONS,
-    LONG_PAUSE_S,
-    engine_options,
-    is_neural,
-    require_fields,
-    without_speaker,
-)
+from talkcli.goals.options import DEFAULTS, ENGINE_OPTIONS, engine_options, is_neural, require_fields, without_speaker
 from talkcli.goals.reasons import Reason
 from talkcli.goals.scheduler import Effect, EngineOrder, Now, Order, PauseChange, StateChange
 from talkcli.goals.states import State
@@ -291,14 +284,15 @@ class Speech:
         log.write(f"{words} by {describe_sender(change.client)}")
         if self._pause_timer:
             self._pause_timer.cancel()
-        self._pause_timer = self._loop.call_later(LONG_PAUSE_S, self._warn_of_pause) if change.paused else None
+        if change.paused:
+            self._pause_timer = self._loop.call_later(goal_options.LONG_PAUSE_S, self._warn_of_pause)
 
     def _warn_of_pause(self) -> None:
         """Log a warning if speech is still paused."""
         self.advance_time()
         if pause := self.scheduler.last_pause:
-            words = f"speech has been paused for {LONG_PAUSE_S / 60:g} minutes, last by {describe_sender(pause.client)}"
-            log.write(f"{words}; continue with: talk resume")
+            minutes, by = goal_options.LONG_PAUSE_S / 60, describe_sender(pause.client)
+            log.write(f"speech has been paused for {minutes:g} minutes, last by {by}; continue with: talk resume")
 
     def describe_pause(self) -> JsonObject:
         """Return the fields of a reply that say whether speech is paused, and by whom.

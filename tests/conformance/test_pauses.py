@@ -97,7 +97,7 @@ def test_a_pause_ends_with_the_input_of_its_client(scripted: Talk) -> None:
 
 
 def test_the_log_tells_of_a_long_pause_and_of_its_end(make_talk: MakeTalk, tmp_path: Path) -> None:
-    talk = make_talk(program=patched_serve(tmp_path, speech__LONG_PAUSE_S=0.06))
+    talk = make_talk(program=patched_serve(tmp_path, speech__goal_options__LONG_PAUSE_S=0.06))
     talk.request("pause", seconds=0.2)
     await_change(talk)
     lines = [line for line in talk.log.splitlines() if "pause" in line]
