@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import signal
 import subprocess
 import sys
 from contextlib import ExitStack
@@ -103,6 +104,30 @@ def test_the_shell_prints_what_was_heard(speaking: Talk, shell: Shell) -> None:
     out, _ = running.communicate(timeout=20)
     goal = speaking.goal(goal_id)
     assert (running.returncode, out) == (7, goal["text"][: goal["spoken_end"]] + "\n")
+
+
+@runs("Listen while the robot is silent")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_speech_continues_after_the_end_of_a_listener(speaking: Talk, number: int) -> None:
+    goal_id = speaking.request("say", text="one two three four five six seven eight nine ten")["goal"]["id"]
+    speaking.watcher.wait_for_word(goal_id)
+    command = [sys.executable, "-c", block("Listen while the robot is silent")]
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen(command, env=speaking.env, **pipes) as listener:
+        assert listener.stdout
+        assert listener.stdout.read(2) == b"> "
+        assert speaking.goal(goal_id)["paused"] is True
+        listener.send_signal(number)
+        assert speaking.watcher.wait_for_terminal(goal_id) == "SUCCEEDED"
+        assert listener.wait() == -number
+
+
+@runs("Listen while the robot is silent #2")
+def test_the_shell_gets_the_answer_of_a_listener(speaking: Talk, shell: Shell) -> None:
+    shell.program("listen", "talk --json status | grep -o '\"paused\": true'; exit 3", directory=shell.directory)
+    done = shell.run(block("Listen while the robot is silent #2") + 'code=$?; echo "$answer" $code')
+    assert done.stdout == '"paused": true 3\n'
+    assert not speaking.request("status")["server"]["paused"]
 
 
 @runs("Was that for me?")
