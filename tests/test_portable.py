@@ -81,6 +81,7 @@ def test_speech_can_be_awaited_paused_cancelled_and_examined(make_talk: MakeTalk
     assert server.run("pause").code == 0
     ids = [server.run("say", text).id for text in ("one", "two", "three")]
     assert server.run("cancel", ids[1]).id == ids[1]
+    assert server.run("pause", "--while", "--", "sh", "-c", "exit 5").code == 5
     assert server.run("resume").code == 0
     assert server.run("wait").code == 0
     assert [server.goal(goal_id)["state"] for goal_id in ids] == ["SUCCEEDED", "RECALLED", "SUCCEEDED"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import signal
 import subprocess
-import sys
 from functools import partial
 
 from talkcli.errors import EXIT_SIGNAL, TalkError
@@ -50,7 +49,7 @@ def _wait_for_signal() -> tuple[int, bool]:
 
     On Ctrl-C, the terminal also sends the signal to the program, so it must not be passed on.
     """
-    if sys.platform == "darwin":  # the sender is unknown
+    if not hasattr(signal, "sigwaitinfo"):  # the sender is unknown, as on macOS
         number = signal.sigwait(_HANDLED_SIGNALS)
         return number, number in _FROM_TERMINAL
     received = signal.sigwaitinfo(_HANDLED_SIGNALS)

@@ -139,9 +139,9 @@ class Connection(ClientCore):
             self.changed.notify_all()
 
     async def open_another(self) -> Connection:
-        """Open another connection to the same server.
+        """Open another connection to the same server, which the server closes if the program dies. Return it.
 
-        Raises UsageError if a connection of this kind doesn't end with the program.
+        Raises UsageError if there is no such connection, because a broker is in between.
         """
         raise UsageError("over a broker, a pause can't end with the program; use pause(seconds=...) instead")
 
@@ -402,7 +402,10 @@ class SocketConnection(Connection):
         self._received_early = attempt.received
 
     async def open_another(self) -> Connection:
-        """Open another connection to the same server, with the same name. The errors are those of `Client`."""
+        """Open another connection to the same server, with the same name, and return it.
+
+        The errors are those of `Client`.
+        """
         return SocketConnection(self._named, name=self._name, patience_s=self._patience)
 
     @property

@@ -249,12 +249,12 @@ def _judge_state(server: JsonObject, now: float) -> Finding:
     """Check the server's state. Return the finding."""
     version, words = server.get("version"), summarize_server(server)
     if server.get("paused") is True:
-        paused = f"{describe_pause(server)}; {words}"
-        if server.get("paused_until") is None:
-            return failure("server", paused, "talk resume")
-        if now - (read_seconds(server.get("paused_at")) or now) >= LONG_PAUSE_S:
-            return warning("server", paused, "talk resume")
-        words = paused
+        words = f"{describe_pause(server)}; {words}"
+        at, until = (read_seconds(server.get(name)) for name in ("paused_at", "paused_until"))
+        if at is None or until is None:
+            return failure("server", words, "talk resume")
+        if max(now - at, until - now) > LONG_PAUSE_S:
+            return warning("server", words, "talk resume")
     if server.get("engine") not in WORKING_STATES:
         return warning("server", words, advise(Reason.ENGINE_FAILED, words))
     if version != __version__:

@@ -307,8 +307,10 @@ def test_another_users_socket_before_the_servers_one_is_a_warning() -> None:
     [
         ({}, "server", OK, "None"),
         ({"paused": True}, "server", FAILURE, "talk resume"),
-        ({"paused": True, "paused_at": -599, "paused_until": 1}, "server", OK, "None"),
-        ({"paused": True, "paused_at": -600, "paused_until": 1}, "server", WARNING, "talk resume"),
+        ({"paused": True, "paused_at": -9, "paused_until": None}, "server", FAILURE, "talk resume"),
+        ({"paused": True, "paused_at": -600, "paused_until": 600}, "server", OK, "None"),
+        ({"paused": True, "paused_at": -601, "paused_until": 1}, "server", WARNING, "talk resume"),
+        ({"paused": True, "paused_at": -1, "paused_until": 601}, "server", WARNING, "talk resume"),
         ({"version": "0.0.1"}, "server", WARNING, "restart the server"),
         ({"engine": "pyttsx3 is missing"}, "server", WARNING, "install the missing part"),
         ({"volume": 0.0}, "settings", FAILURE, "talk set --volume 1"),
