@@ -65,7 +65,5 @@ def run_blocking(coroutine: Coroutine[Any, Any, _T]) -> _T:
     try:
         coroutine.send(None)
     except StopIteration as end:
-        result: _T = end.value
-        return result
-    coroutine.close()
+        return end.value  # type: ignore[no-any-return]
     raise AssertionError(f"{coroutine!r} has suspended")

@@ -161,7 +161,7 @@ def test_the_greeting_and_replies_may_take_the_remaining_time(
     waits = Waits(monkeypatch)
     with serving(path, GREETING):
         end = None if left is None else time.monotonic() + left
-        connection = SocketConnection(path, keep_trying_s=keep_trying_s, end=end)
+        connection = polling.run_blocking(SocketConnection.open(path, keep_trying_s=keep_trying_s, end=end))
         connection.close()
     assert all(least <= seconds <= most for seconds in waits.others)
     assert max(least, 4) <= connection._patience <= max(most, 5)

@@ -27,6 +27,7 @@ from talkcli.errors import (
 )
 from talkcli.goals.options import OPTIONS
 from talkcli.goals.states import State
+from talkcli.polling import run_blocking
 from talkcli.protocol.lines import MAX_LINE_BYTES, encode
 from tests.conformance.rawsocket import GREETING, FakeServer
 from tests.support.patched_serve import patched_serve
@@ -209,10 +210,10 @@ def test_a_full_server_answers_urgent_clients_and_refuses_others(make_talk: Make
         started_at = time.monotonic()
         assert talk.run("status", goal_id).code == 0
         assert talk.run("cancel").id == goal_id
-        with Client.over(SocketConnection(talk.socket, urgent=True)) as urgent:
+        with Client.over(run_blocking(SocketConnection.open(talk.socket, urgent=True))) as urgent:
             assert [goal.id for goal in urgent.status().recent] == [goal_id]
         with pytest.raises(Busy, match="--max-clients"):
-            SocketConnection(talk.socket, patience_s=0.5)
+            run_blocking(SocketConnection.open(talk.socket, patience_s=0.5))
         assert 0.5 <= time.monotonic() - started_at < 2.5
         late = talk.start("say", "--wait", "length=0")
     assert talk.finish(late).code == 0  # it was admitted when a place became free

@@ -16,7 +16,7 @@ from talkcli import Client, GoalHandle
 from talkcli.client.connection import SocketConnection
 from talkcli.errors import Lost, ServerUnavailable, UnknownGoal
 from talkcli.goals.states import State
-from talkcli.polling import Interrupted
+from talkcli.polling import Interrupted, run_blocking
 from talkcli.protocol.events import Event, PausedChanged, Result, Snapshot, StateChanged, WordHeard
 from talkcli.protocol.lines import MAX_LINE_BYTES
 from tests.support.connection import PATIENCE
@@ -40,7 +40,7 @@ def test_a_patient_say_waits_while_the_server_is_alive() -> None:
         peer.reply("status", **OVERVIEW)
         peer.send(result())
 
-    with serving(play) as path, Client.over(SocketConnection(path, patience_s=0.2)) as client:
+    with serving(play) as path, Client.over(run_blocking(SocketConnection.open(path, patience_s=0.2))) as client:
         handle = client.say("a", patient=True)
         assert (handle.state, handle.speech_paused, handle.attached) == (State.PENDING, True, False)
         client.status()
@@ -54,7 +54,7 @@ def test_a_reply_to_pause_may_take_longer_than_the_timeout() -> None:
         peer.send({"seq": seq, "ok": True, "paused": True, "goal": goal("ACTIVE")})
         peer.reply("resume", paused=False, goal=None)
 
-    with serving(play) as path, Client.over(SocketConnection(path, patience_s=0.2)) as client:
+    with serving(play) as path, Client.over(run_blocking(SocketConnection.open(path, patience_s=0.2))) as client:
         paused = client.pause()
         assert paused
         assert paused.state is State.ACTIVE
@@ -63,7 +63,7 @@ def test_a_reply_to_pause_may_take_longer_than_the_timeout() -> None:
 
 def test_a_silent_server_is_considered_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("talkcli.client.core.SILENCE_LIMIT_S", 0.3)
-    with serving(ignore_say) as path, Client.over(SocketConnection(path, patience_s=5)) as client:
+    with serving(ignore_say) as path, Client.over(run_blocking(SocketConnection.open(path, patience_s=5))) as client:
         started_at = time.monotonic()
         with pytest.raises(Lost, match=r"nothing for 0\.3 s"):
             client.say("a", patient=True)
@@ -199,7 +199,10 @@ def test_an_interrupt_ends_a_wait_and_loses_no_event(
         peer.reply("status", **OVERVIEW)
         peer.send(peer.word(), result())
 
-    with serving(play) as path, Client.over(SocketConnection(path, interrupt={interrupt[0]: select.POLLIN})) as client:
+    with (
+        serving(play) as path,
+        Client.over(run_blocking(SocketConnection.open(path, interrupt={interrupt[0]: select.POLLIN}))) as client,
+    ):
         handle = client.say("a", feedback=True)
         with pytest.raises(Interrupted):
             wait(handle)
@@ -224,7 +227,7 @@ def test_an_interrupt_ends_a_long_call(interrupt: tuple[int, int], kind: str, ca
         os.write(interrupt[1], b"x")
 
     with serving(play) as path:
-        client = Client.over(SocketConnection(path, interrupt={interrupt[0]: select.POLLIN}))
+        client = Client.over(run_blocking(SocketConnection.open(path, interrupt={interrupt[0]: select.POLLIN})))
         with client, pytest.raises(Interrupted):
             call(client)
 

@@ -118,7 +118,7 @@ def test_a_process_that_admits_no_client_is_reported(home: str, greeting: str, m
 
 @pytest.mark.usefixtures("nobody_serves")
 def test_a_stopped_or_full_server_is_reported(make_talk: MakeTalk, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, "SocketConnection", partial(SocketConnection, patience_s=0.5))
+    monkeypatch.setattr(SocketConnection, "open", partial(SocketConnection.open, patience_s=0.5))
     talk = make_talk("--max-clients", "1", scripted=True, watched=False)
     with talk.connect() as wire:
         assert wire.request("hello")["ok"]

@@ -16,11 +16,13 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from talkcli.aio.client import Client, GoalHandle, SpeechStream
+    from talkcli.fleet.aio import Fleet
 
-__all__ = ["Client", "GoalHandle", "SpeechStream"]
+__all__ = ["Client", "Fleet", "GoalHandle", "SpeechStream"]
 
 
 def __getattr__(name: str) -> object:
     if name not in __all__:
         raise AttributeError(f"module 'talkcli.aio' has no attribute {name!r}")
-    return getattr(__import__("talkcli.aio.client", fromlist=[name]), name)
+    module = "fleet.aio" if name == "Fleet" else "aio.client"
+    return getattr(__import__(f"talkcli.{module}", fromlist=[name]), name)

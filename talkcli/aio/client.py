@@ -17,13 +17,12 @@ from functools import partial
 from inspect import signature
 from typing import TYPE_CHECKING
 
-from talkcli.aio.connection import connect_socket
+from talkcli.aio.connection import LoopSocketConnection
 from talkcli.client import client as blocking
-from talkcli.client.calls import ClientCalls
+from talkcli.client.calls import ClientCalls, SayingCalls
 from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.client.connection import event_reader
 from talkcli.client.goal import GoalCalls, end_time
-from talkcli.client.saying import SayingCalls
 from talkcli.client.stream import StreamCalls
 from talkcli.errors import UsageError
 from talkcli.goals.options import PAUSE_S, SOUND
@@ -64,23 +63,21 @@ class GoalHandle(GoalCalls):
 
     def events(self, timeout: float | None = None) -> AsyncIterator[Event]:
         """Iterate over the goal's events as they happen. The last event is the Result."""
-        return self._iterate_events(end_time(timeout), timeout)
+        return self._iterate_events(timeout, feedback=False)
 
     def feedback(self, timeout: float | None = None) -> AsyncIterator[WordHeard]:
         """Iterate over the goal's words as they are heard, until the goal has ended."""
-        found = self._iterate_events(end_time(timeout), timeout, feedback=True)
-        return (each async for each in found if isinstance(each, WordHeard))
+        events = self._iterate_events(timeout, feedback=True)
+        return (event async for event in events if isinstance(event, WordHeard))
 
     async def cancel(self) -> Goal:
         """Cancel the goal, and wait until it has stopped. Return it."""
         return await self._cancel()
 
-    async def _iterate_events(
-        self, end: float | None, timeout: float | None, *, feedback: bool = False
-    ) -> AsyncIterator[Event]:
-        """Yield the goal's events up to the Result. Raise TimeoutError if `end` (monotonic) passes first."""
+    async def _iterate_events(self, timeout: float | None, *, feedback: bool) -> AsyncIterator[Event]:
+        """Yield the goal's events up to the Result. Raise TimeoutError if `timeout` expires first."""
+        read, event = event_reader(self._connection, self._take, end_time(timeout)), None
         await self._follow(feedback=feedback)
-        read, event = event_reader(self._connection, self._take, end), None
         while not isinstance(event, Result):
             event = await self._read_event(read, timeout)
             yield event
@@ -133,7 +130,9 @@ class Client(ClientCalls):
 
     def __init__(self, socket: str | None = None, *, name: str | None = None, timeout: float = ANSWER_LIMIT_S) -> None:
         """Create a client, without connecting it. The arguments are those of the blocking client."""
-        self._open: Callable[[], Awaitable[LoopConnection]] = partial(connect_socket, socket, name, timeout)
+        self._open: Callable[[], Awaitable[LoopConnection]] = partial(
+            LoopSocketConnection.open, socket, name=name, patience_s=timeout
+        )
 
     async def connect(self) -> Client:
         """Connect to the server, unless the client is connected. Return the client.

@@ -10,14 +10,15 @@ import time
 from select import POLLIN, POLLOUT
 from typing import TYPE_CHECKING
 
-from talkcli import paths, polling
-from talkcli.client.connect import connect, hello
-from talkcli.client.connection import Connection, ReconnectingConnection, checked_sender_name
+from talkcli import polling
+from talkcli.client.connection import Connection, ReconnectingConnection
 from talkcli.polling import NEVER
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from typing import Any
+
+    from typing_extensions import Self
 
     from talkcli.client.core import Exchange, OnFailure, OnReply
     from talkcli.protocol.requests import Request
@@ -84,17 +85,24 @@ class LoopConnection(Connection):
     Nothing blocks.
     """
 
-    #: what the loop waits for, or None before `start` and after the end of the connection
+    wait = staticmethod(wait_ready)
+    #: what the loop waits for, or None before and after the connection is open
     _watch: Watch | None = None
+    #: the earliest time limit of the connection and all waiting coroutines (monotonic time)
+    _limit = NEVER
+    #: by the future of each coroutine in `until`: its condition, its deadline, and when it started to wait
+    _waits: dict[asyncio.Future[bool], tuple[Callable[[], bool], float, float]]
 
-    def start(self) -> None:
-        """Let the event loop run this connection."""
-        self._loop = asyncio.get_running_loop()
-        #: by the future of each coroutine in `until`: its condition, its deadline, and when it started to wait
-        self._waits: dict[asyncio.Future[bool], tuple[Callable[[], bool], float, float]] = {}
-        #: the earliest time limit of the connection and all waiting coroutines (monotonic time)
-        self._limit = NEVER
-        self._watch = Watch({}, 0.0, self._run)
+    @classmethod
+    async def open(cls, *arguments: Any, **options: Any) -> Self:
+        """Connect to a server, and let the event loop run the connection. Return it.
+
+        The arguments and errors are those of the transport.
+        """
+        connection = await super().open(*arguments, **options)
+        connection._waits = {}
+        connection._watch = Watch({}, 0.0, connection._run)
+        return connection
 
     def close(self) -> None:
         """Close the connection, and wake all waiting coroutines. Goals that were sent are still spoken."""
@@ -112,7 +120,7 @@ class LoopConnection(Connection):
             return True
         if self.ended is not None:
             return False
-        future: asyncio.Future[bool] = self._loop.create_future()
+        future: asyncio.Future[bool] = asyncio.get_running_loop().create_future()
         self._waits[future] = done, NEVER if deadline is None else deadline, time.monotonic()
         self._run_soon()
         try:
@@ -182,19 +190,3 @@ class LoopConnection(Connection):
 
 class LoopSocketConnection(LoopConnection, ReconnectingConnection):
     """A connection over a Unix socket that reconnects after a break, and is run by the event loop."""
-
-    async def open_another(self) -> LoopSocketConnection:
-        """Open another connection to the same server, with the same name."""
-        return await connect_socket(self._named, self._name, self._patience)
-
-
-async def connect_socket(socket: str | None, name: str | None, patience_s: float) -> LoopSocketConnection:
-    """Connect to a server. Return the connection.
-
-    The arguments and errors are those of `ReconnectingConnection`.
-    """
-    message = hello(checked_sender_name(name), urgent=False)
-    attempt = await connect(paths.named_socket(socket), message, patience_s, wait=wait_ready)
-    connection = LoopSocketConnection(socket, name=name, patience_s=patience_s, attempt=attempt)
-    connection.start()
-    return connection

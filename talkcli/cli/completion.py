@@ -25,6 +25,7 @@ from click.shell_completion import CompletionItem, ShellComplete, split_arg_stri
 from talkcli.cli.show import show
 from talkcli.errors import EXIT_ERROR, EXIT_OK, TalkError
 from talkcli.goals.options import is_neural
+from talkcli.polling import run_blocking
 from talkcli.protocol.events import unfinished
 from talkcli.terminal.text import printable
 
@@ -232,7 +233,7 @@ def robots(options: CommonOptions, _: str) -> Offers:
     from talkcli.fleet import topics
     from talkcli.fleet.desk.watch import read_robots
 
-    found = read_robots(broker, COMPLETION_TIMEOUT_S, with_status=False)
+    found = run_blocking(read_robots(broker, COMPLETION_TIMEOUT_S, with_status=False))
     online = [each.presence for each in found if each.presence.online]
     members = Counter(f"@{group}" for each in online for group in {*each.groups} if not topics.name_fault(group))
     return [

@@ -12,6 +12,7 @@ from talkcli.errors import EXIT_SIGPIPE, ServerUnavailable
 from talkcli.fleet.desk.request import Selection
 from talkcli.fleet.desk.table import FleetTranscript, format_robots
 from talkcli.fleet.payloads import Presence, RobotInfo
+from talkcli.polling import run_blocking
 
 if TYPE_CHECKING:
     from talkcli.cli.show import CommonOptions
@@ -33,7 +34,7 @@ def fleet(options: CommonOptions, action: str, long: bool) -> int | None:
         return _watch(options, broker, selection, long=long)
     from talkcli.fleet.desk.watch import read_robots
 
-    found = read_robots(broker, ANSWER_LIMIT_S, selection.name if selection else None)
+    found = run_blocking(read_robots(broker, ANSWER_LIMIT_S, selection.name if selection else None))
     selected = [each for each in found if selection is None or selection.includes(each.presence)]
     if not selected:
         raise _no_robot_error(broker, selection)

@@ -14,6 +14,7 @@ import time
 from talkcli import __version__, paths
 from talkcli.errors import EXIT_ERROR, EXIT_SIGINT, EXIT_SIGPIPE, ServerUnavailable, TalkError, TimedOut, memory_hint
 from talkcli.frozen import TYPE_CHECKING
+from talkcli.polling import run_blocking
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -78,7 +79,7 @@ class CommonOptions:
 
         Args:
             timeout: time limit in seconds for the whole command, and for each answer from the server.
-            options: further arguments of `SocketConnection`.
+            options: further arguments of `SocketConnection.open`.
 
         Raises:
             TimeoutError: no server was found in time. This is only raised if `connect_timeout` is set.
@@ -120,11 +121,12 @@ class CommonOptions:
         if not robot:
             from talkcli.client.connection import SocketConnection
 
-            return SocketConnection(self.socket, attempt=self.early, urgent=self.urgent, **options)
+            options = {"attempt": self.early, "urgent": self.urgent, **options}
+            return run_blocking(SocketConnection.open(self.socket, **options))
         broker = self.broker()
-        from talkcli.fleet.desk.robot import connect_robot
+        from talkcli.fleet.desk.robot import RobotConnection
 
-        return connect_robot(robot, broker, **options)
+        return run_blocking(RobotConnection.open(robot, broker, **options))
 
 
 def run_command(command: Callable[[], object], options: CommonOptions) -> int:

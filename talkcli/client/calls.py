@@ -10,7 +10,7 @@ import time
 
 from talkcli.client.connection import event_reader
 from talkcli.client.core import EventBuffer
-from talkcli.errors import Lost, UnknownGoal, UsageError
+from talkcli.errors import Lost, TalkError, UnknownGoal, UsageError
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import MAX_ID_CHARS, MAX_IDS, Cancel, Log, Pause, Say, Set, bad_option, key_error
@@ -51,13 +51,11 @@ def with_parameters_of(
 class ClientCalls:
     """The calls of a client. Those that wait are coroutines."""
 
-    _connection: Connection
-    #: the first server's boot id, which is prepended to ids that are only numbers
-    _first_boot: str
-
     def __init__(self, connection: Connection) -> None:
         """Use a connection that has received the server's greeting."""
-        self._connection, self._first_boot = connection, connection.boot
+        self._connection = connection
+        #: the first server's boot id, which is prepended to ids that are only numbers
+        self._first_boot = connection.boot
 
     @property
     def path(self) -> str:
@@ -180,19 +178,12 @@ class ClientCalls:
             raise
 
     async def _say(
-        self,
-        handle_type: type[_Handle],
-        text: str,
-        *,
-        id: str | None = None,  # noqa: A002 - the option has this name everywhere
-        feedback: bool = False,
-        follow: bool = True,
-        block: bool = True,
-        **options: Any,
+        self, handle_type: type[_Handle], text: str, *, follow: bool = True, block: bool = True, **options: Any
     ) -> _Handle:
         """Send a text to be spoken. Return the handle of its goal."""
-        goal_id = id or (None if block else self._connection.new_goal_id())
-        request = Say(text, id=goal_id, feedback=feedback, wait=follow or feedback, **options)
+        request = Say(text, wait=follow or options.get("feedback") is True, **options)
+        if not (block or request.id):
+            request = replace(request, id=self._connection.new_goal_id())
         handle, accepted = self._create_handle(handle_type, request)
         if handle.state.terminal:
             return handle
@@ -203,17 +194,13 @@ class ClientCalls:
             self._connection.submit(request, accepted, handle._fail)
         return handle
 
-    def _stream_request(
-        self,
-        id: str | None = None,  # noqa: A002 - the option has this name everywhere
-        **options: Any,
-    ) -> Say:
+    def _stream_request(self, **options: Any) -> Say:
         """Check the options of a stream. Return its `say` request, which has no text yet."""
-        say = Say("", id=id, wait=True, more=True, **options)
+        say = Say("", wait=True, more=True, **options)
         check(say)
         if error := self._connection.unsupported(say):
             raise error
-        if id is None and self._connection.reconnects:
+        if say.id is None and self._connection.reconnects:
             say = replace(say, id=self._connection.new_goal_id())
         return say
 
@@ -281,6 +268,39 @@ class ClientCalls:
             goal_id = f"{self._first_boot}-{goal_id}"
         check_id(goal_id)
         return goal_id
+
+
+class SayingCalls:
+    """The base class of context managers that speak a text until their block ends."""
+
+    def __init__(self, client: ClientCalls, *text: str, **options: Any) -> None:
+        """Prepare to speak a text, without sending anything.
+
+        The arguments are those of `Client.say`. The client chooses the id, so that the goal can be cancelled even if
+        the wait for the server's answer is interrupted.
+        """
+        self._client, self._text = client, text
+        self._options = {**options, "id": options.get("id") or client._connection.new_goal_id()}
+
+    async def _begin(self, handle_type: type[_Handle]) -> _Handle:
+        """Send the goal. Return its handle."""
+        try:
+            handle = await self._client._say(handle_type, *self._text, **self._options)
+        except TalkError:
+            raise
+        except BaseException:
+            self._client._connection.begin(Cancel((self._options["id"],)), on_failure=lambda _: None)
+            raise
+        self._cancel = handle._cancel
+        return handle
+
+    async def _end(self, *, failed: bool) -> None:
+        """Cancel the goal, unless it has ended. If the block has failed, ignore errors."""
+        try:
+            await self._cancel()
+        except TalkError:
+            if not failed:
+                raise
 
 
 def check_id(goal_id: str) -> None:

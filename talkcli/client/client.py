@@ -12,7 +12,7 @@ All errors except TimeoutError are subclasses of `talkcli.errors.TalkError`.
 
 from __future__ import annotations
 
-from talkcli.client.calls import ClientCalls, with_parameters_of
+from talkcli.client.calls import ClientCalls, SayingCalls, with_parameters_of
 from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.client.connection import ReconnectingConnection
 from talkcli.client.goal import GoalHandle
@@ -21,12 +21,11 @@ from talkcli.goals.options import PAUSE_S, SOUND, STALL_S
 from talkcli.polling import run_blocking
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Iterable, Iterator
+    from collections.abc import Iterable, Iterator
     from contextlib import AbstractContextManager
     from typing import Any
 
     from talkcli.client.connection import Connection
-    from talkcli.client.saying import Saying
     from talkcli.client.stream import SpeechStream
     from talkcli.goals.goal import Goal, JsonObject
     from talkcli.goals.states import State
@@ -61,7 +60,7 @@ class Client:
             UsageError: the name is too long, or the timeout is not positive.
             ServerUnavailable, AccessDenied, Busy, ProtocolMismatch: there is no server that can be used.
         """
-        self._connection: Connection = ReconnectingConnection(socket, name=name, patience_s=timeout)
+        self._connection: Connection = run_blocking(ReconnectingConnection.open(socket, name=name, patience_s=timeout))
         self._calls = ClientCalls(self._connection)
 
     @classmethod
@@ -176,8 +175,6 @@ class Client:
         At the end of the block, the errors are those of `GoalHandle.cancel`. If an exception ends the block, it is
         raised instead.
         """
-        from talkcli.client.saying import Saying  # rarely needed, and slow to import
-
         return Saying(self._calls, text, **options)
 
     @with_parameters_of(say)
@@ -438,10 +435,15 @@ class Client:
         Raises:
             Lost: the connection broke and `reconnect` is False, or more than 10,000 states were not read in time.
         """
-        return _repeat(run_blocking(self._calls._watch(reconnect=reconnect)))
+        next_event = run_blocking(self._calls._watch(reconnect=reconnect))
+        return iter(lambda: run_blocking(next_event()), None)
 
 
-def _repeat(next_event: Callable[[], Coroutine[Any, Any, Event]]) -> Iterator[Event]:
-    """Call a coroutine function again and again. Yield its results."""
-    while True:
-        yield run_blocking(next_event())
+class Saying(SayingCalls):
+    """A text that is spoken until a `with` block ends. `Client.saying` creates it."""
+
+    def __enter__(self) -> GoalHandle:
+        return run_blocking(self._begin(GoalHandle))
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        run_blocking(self._end(failed=kind is not None))

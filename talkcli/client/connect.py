@@ -260,11 +260,7 @@ def _server_may_start(attempt: ConnectionAttempt) -> bool:
 
 
 async def _greet(
-    attempt: ConnectionAttempt,
-    hello: JsonObject,
-    deadline: float,
-    interrupt: Mapping[int, int] | None,
-    wait: WaitReady,
+    attempt: ConnectionAttempt, hello: JsonObject, deadline: float, interrupt: Mapping[int, int] | None, wait: WaitReady
 ) -> ConnectionAttempt:
     """Send the hello message if necessary, and read the server's greeting. Return the updated attempt.
 

@@ -18,7 +18,7 @@ from talkcli.client.core import MAX_UNSENT_BYTES, ClientCore, Exchange
 from talkcli.errors import ProtocolMismatch, ServerUnavailable, TalkError, UsageError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import MAX_SENDER_NAME_CHARS, Cancel, Say
-from talkcli.polling import NEVER, run_blocking, wait_ready
+from talkcli.polling import NEVER, block_until_ready, wait_ready
 from talkcli.protocol.lines import request_line
 
 if TYPE_CHECKING:
@@ -26,9 +26,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Coroutine, Mapping
     from typing import Any, TypeVar
 
+    from typing_extensions import Self
+
     from talkcli.client.connect import ConnectionAttempt
     from talkcli.client.core import OnFailure, OnReply
     from talkcli.goals.goal import JsonObject
+    from talkcli.polling import WaitReady
     from talkcli.protocol.requests import Request
 
     _T = TypeVar("_T")
@@ -97,6 +100,8 @@ class Connection(ClientCore):
     ServerUnavailable. Events that were received before can still be read.
     """
 
+    #: waits until descriptors are ready, while the connection is being opened
+    wait: WaitReady = staticmethod(block_until_ready)
     #: whether the connection is opened again after a break
     reconnects = False
     #: descriptors that interrupt any wait, with their poll events
@@ -117,6 +122,11 @@ class Connection(ClientCore):
         self._process = os.getpid()
         self._reading = False
         self._closing = False
+
+    @classmethod
+    async def open(cls, *arguments: Any, **options: Any) -> Self:
+        """Connect to a server. Return the connection. Each transport has its own arguments."""
+        raise NotImplementedError
 
     def close(self) -> None:
         """Close the connection. Goals that were sent are still spoken.
@@ -353,44 +363,22 @@ class SocketConnection(Connection):
 
     def __init__(
         self,
-        socket: str | None = None,
-        *,
-        name: str | None = None,
-        urgent: bool = False,
-        interrupt: Mapping[int, int] | None = None,
-        patience_s: float = ANSWER_LIMIT_S,
-        attempt: ConnectionAttempt | None = None,
-        keep_trying_s: float = 0.0,
-        end: float | None = None,
+        attempt: ConnectionAttempt,
+        patience_s: float,
+        reopen: tuple[str | None, str | None, JsonObject],
+        interrupt: Mapping[int, int] | None,
     ) -> None:
-        """Connect to a server.
-
-        The errors are those of `Client`.
+        """Use the connection of an attempt that has read the server's greeting.
 
         Args:
-            socket: path of the server's socket. The default is TALK_SOCKET, or else the usual places.
-            name: the sender's name. The default is TALK_NAME.
-            urgent: whether the client sends only `status` and `cancel`. A full server keeps some places for such
-                clients.
-            interrupt: descriptors that interrupt any wait, with their poll events, as in `polling.wait_ready`.
-            patience_s: seconds in which the server must send its greeting, and must answer each request.
-            attempt: an open connection, on which the first request may have been sent. If its greeting has been read,
-                nothing blocks.
-            keep_trying_s: seconds for which to try again if there is no server yet. After connecting, the rest of this
-                time is the limit for each answer, unless `patience_s` is longer.
-            end: with `keep_trying_s`, the monotonic time by which the server must have sent its greeting. None for no
-                limit.
+            attempt: the attempt.
+            patience_s: seconds in which the server must answer.
+            reopen: the named socket, the sender's name and the hello message, which are needed to connect again.
+            interrupt: descriptors that interrupt any wait.
         """
         super().__init__(patience_s)
         self._interrupt = interrupt
-        self._name = checked_sender_name(name)
-        self._hello_message = hello(self._name, urgent=urgent)
-        self._named = paths.named_socket(socket)
-        give_up = time.monotonic() + keep_trying_s
-        if not (attempt and attempt.server):
-            options = patience_s, interrupt, attempt, keep_trying_s, end
-            attempt = run_blocking(connect(self._named, self._hello_message, *options))
-        self._patience = max(patience_s, round(give_up - time.monotonic(), 1))
+        self._named, self._name, self._hello_message = reopen
         #: the socket, or None while disconnected
         self._socket: _socket.socket | None = attempt.socket
         #: the socket that a thread may be polling. Only that thread closes it.
@@ -401,12 +389,49 @@ class SocketConnection(Connection):
         #: bytes received after the greeting. They are processed after the early request is registered.
         self._received_early = attempt.received
 
+    @classmethod
+    async def open(
+        cls,
+        socket: str | None = None,
+        *,
+        name: str | None = None,
+        urgent: bool = False,
+        interrupt: Mapping[int, int] | None = None,
+        patience_s: float = ANSWER_LIMIT_S,
+        attempt: ConnectionAttempt | None = None,
+        keep_trying_s: float = 0.0,
+        end: float | None = None,
+    ) -> Self:
+        """Connect to a server. Return the connection.
+
+        The errors are those of `Client`.
+
+        Args:
+            socket: path of the server's socket. The default is TALK_SOCKET, or else the usual places.
+            name: the sender's name. The default is TALK_NAME.
+            urgent: whether the client sends only `status` and `cancel`. A full server keeps some places for such
+                clients.
+            interrupt: descriptors that interrupt any wait, with their poll events, as in `polling.wait_ready`.
+            patience_s: seconds in which the server must send its greeting, and must answer each request.
+            attempt: an open connection, on which the first request may have been sent.
+            keep_trying_s: seconds for which to try again if there is no server yet. After connecting, the rest of this
+                time is the limit for each answer, unless `patience_s` is longer.
+            end: with `keep_trying_s`, the monotonic time by which the server must have sent its greeting. None for no
+                limit.
+        """
+        name, named = checked_sender_name(name), paths.named_socket(socket)
+        message = hello(name, urgent=urgent)
+        give_up = time.monotonic() + keep_trying_s
+        found = await connect(named, message, patience_s, interrupt, attempt, keep_trying_s, end, cls.wait)
+        patience_s = max(patience_s, round(give_up - time.monotonic(), 1))
+        return cls(found, patience_s, (named, name, message), interrupt)
+
     async def open_another(self) -> Connection:
         """Open another connection to the same server, with the same name, and return it.
 
         The errors are those of `Client`.
         """
-        return SocketConnection(self._named, name=self._name, patience_s=self._patience)
+        return await self.open(self._named, name=self._name, patience_s=self._patience)
 
     @property
     def listener_pid(self) -> int | None:  # type: ignore[override]
@@ -495,19 +520,8 @@ class ReconnectingConnection(SocketConnection):
     """
 
     reconnects = True
-
-    def __init__(
-        self,
-        socket: str | None = None,
-        *,
-        name: str | None = None,
-        patience_s: float = ANSWER_LIMIT_S,
-        attempt: ConnectionAttempt | None = None,
-    ) -> None:
-        """Connect to a server. The arguments are those of `SocketConnection`."""
-        super().__init__(socket, name=name, patience_s=patience_s, attempt=attempt)
-        #: monotonic time of the next attempt to connect. During an attempt, the greeting must arrive by this time.
-        self._due = 0.0
+    #: monotonic time of the next attempt to connect. During an attempt, the greeting must arrive by this time.
+    _due = 0.0
 
     def begin(self, request: Request, on_reply: OnReply | None = None, on_failure: OnFailure | None = None) -> Exchange:
         """Reconnect if necessary, and send a request. Return the exchange."""
@@ -538,7 +552,7 @@ class ReconnectingConnection(SocketConnection):
 
     def prepare(self, now: float) -> tuple[dict[int, int], float]:
         """Reconnect if the connection is needed. Return the socket with its poll events, and when to call `process`."""
-        is_needed = bool(self.exchanges or self.listeners)
+        is_needed = bool(self.exchanges or self.listeners.goals or self.listeners.watches)
         if self._socket is not None and not self.greeted and now >= self._due:
             self._drop()
             self._give_up_socket()

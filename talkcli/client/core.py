@@ -118,10 +118,6 @@ class EventListeners:
         #: the buffers of the readers that watch all goals. A reader stops watching by dropping its buffer.
         self.watches: WeakSet[EventBuffer] = WeakSet()
 
-    def __bool__(self) -> bool:
-        """Return whether there is a receiver."""
-        return bool(self._goals or self.watches)
-
     def add(self, tracked_goal: TrackedGoal) -> None:
         """Start passing a goal's events, and all pause events, to `tracked_goal`.
 

@@ -25,11 +25,11 @@ from talkcli.doctor.voice import WORKING_STATES
 from talkcli.errors import ServerUnavailable, TalkError, UsageError
 from talkcli.fleet import topics
 from talkcli.fleet.broker import CA, URL, USER, client_user, from_environment, is_local
-from talkcli.fleet.desk.robot import connect_robot
+from talkcli.fleet.desk.robot import RobotConnection
 from talkcli.fleet.link import LOGIN_LIMIT_S, MAX_RECEIVE_COUNT, REASON_NOT_AUTHORIZED, Link
 from talkcli.fleet.payloads import Message, Presence
 from talkcli.frozen import replace
-from talkcli.polling import wait_ready
+from talkcli.polling import run_blocking, wait_ready
 from talkcli.terminal.goals import describe_pause
 from talkcli.terminal.text import printable
 
@@ -228,10 +228,10 @@ class BrokerExamination:
         """Request the status of the robot's server. Return the finding."""
         end = time.monotonic() + _STEP_LIMIT_S
         try:
-            connection = connect_robot(
+            connecting = RobotConnection.open(
                 self._robot, broker, name="talk doctor", interrupt=self._interrupt, patience_s=LOGIN_LIMIT_S, end=end
             )
-            with Client.over(connection) as client:
+            with Client.over(run_blocking(connecting)) as client:
                 began = time.monotonic()
                 server = client.status().server
                 return judge_server_status(self._robot, server, time.monotonic() - began)

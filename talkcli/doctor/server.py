@@ -24,6 +24,7 @@ from talkcli.goals.options import LONG_PAUSE_S, describe_settings
 from talkcli.goals.reasons import Reason
 from talkcli.goals.states import State
 from talkcli.paths import PLACE_ABSENT, PLACE_DIRECTORY, PLACE_FILE, PLACE_FORBIDDEN, PLACE_STALE
+from talkcli.polling import run_blocking
 from talkcli.terminal.goals import clock_time, describe_pause
 
 if TYPE_CHECKING:
@@ -98,7 +99,7 @@ def connect(socket_option: str | None, interrupt: Mapping[int, int] | None) -> t
     # At these places, clients trust a server of any user.
     trusted_paths = {named, paths.SYSTEM_SOCKET}
     try:
-        client = Client.over(SocketConnection(socket_option, name=DOCTOR_NAME, interrupt=interrupt))
+        client = Client.over(run_blocking(SocketConnection.open(socket_option, name=DOCTOR_NAME, interrupt=interrupt)))
     except TalkError as error:
         return None, explain_missing_server([_probe_path(each, trusted_paths) for each in tried], named_by, error)
     before = [_probe_path(each, trusted_paths) for each in tried[: tried.index(client.path)]]

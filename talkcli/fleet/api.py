@@ -10,13 +10,14 @@ for outcome in fleet.say("@warehouse", "the shift is over"):
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 from talkcli.client.client import Client
 from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.fleet.broker import URL, from_environment, require_paho
 from talkcli.fleet.desk.request import Selection
 from talkcli.goals.options import Cancel, Pause, Say, Set
+from talkcli.polling import run_blocking
 from talkcli.protocol.requests import Request, Resume, Status, Wait
 
 if TYPE_CHECKING:
@@ -27,22 +28,12 @@ if TYPE_CHECKING:
     from talkcli.fleet.payloads import Presence
 
 
-class Fleet:
-    """All robots that use the same broker.
+#: The class of a fleet's requests, which is FleetRequest in the blocking and in the asyncio library.
+FleetRequestT = TypeVar("FleetRequestT")
 
-    Most methods have an argument `to` that selects robots. It is the name of a robot, a pattern that matches names
-    (`wh-*`), or a group (`@warehouse`). The group `@all` contains every robot.
 
-    These methods return a FleetRequest. Iterate over it to receive the outcomes as they arrive. There is one for each
-    robot, or one for each goal if the request affects several goals. If a robot is offline, its outcome has exit code
-    3, and the robot doesn't receive the request later.
-
-    Each request opens its own connection to the broker, and closes it after the last outcome. To close it earlier, use
-    the FleetRequest in a `with` block or call its `close`. Always exhaust or close the FleetRequest, or the request may
-    not be sent.
-
-    Several threads may use the same Fleet. Only one thread may use a FleetRequest.
-    """
+class FleetCalls(Generic[FleetRequestT]):
+    """The base class of fleets. It has the methods that create requests."""
 
     def __init__(self, broker: str | None = None, *, name: str | None = None, insecure: bool = False) -> None:
         """Configure access to a fleet, without connecting to the broker.
@@ -62,31 +53,7 @@ class Fleet:
         self._broker = from_environment(environment, insecure=insecure)
         self._name = name
 
-    def robots(self) -> list[Presence]:
-        """Return all robots of the fleet, sorted by name.
-
-        This includes robots that are offline.
-
-        Raises:
-            ServerUnavailable: The broker can't be reached.
-            AccessDenied: The broker rejected the login, or its access rules don't allow the request.
-        """
-        from talkcli.fleet.desk.watch import read_robots
-
-        return [each.presence for each in read_robots(self._broker, ANSWER_LIMIT_S, with_status=False)]
-
-    def robot(self, name: str) -> Client:
-        """Connect to one robot. The returned client works like the client of a local server.
-
-        Raises:
-            ServerUnavailable: The broker can't be reached, or the robot is unknown, offline or without a server.
-            AccessDenied: The broker rejected the login, or its access rules don't allow the request.
-        """
-        from talkcli.fleet.desk.robot import connect_robot
-
-        return Client.over(connect_robot(name, self._broker, name=self._name))
-
-    def say(self, to: str, text: str, *, wait: bool = True, ttl: float | None = None, **options: Any) -> FleetRequest:
+    def say(self, to: str, text: str, *, wait: bool = True, ttl: float | None = None, **options: Any) -> FleetRequestT:
         """Speak a text on each robot. Return the request, which yields the outcomes.
 
         The goal has the same id on all robots. To cancel it, call `cancel` on the returned FleetRequest. After the last
@@ -109,7 +76,7 @@ class Fleet:
         current: bool = False,
         before: str | None = None,
         key: str | None = None,
-    ) -> FleetRequest:
+    ) -> FleetRequestT:
         """Cancel some or all goals on each robot. Return the request.
 
         The request yields the outcomes. By default, all goals are cancelled. The other arguments are those of
@@ -117,35 +84,82 @@ class Fleet:
         """
         return self._send_request(to, Cancel(None if ids is None else tuple(ids), current, before, key))
 
-    def wait(self, to: str, ids: Iterable[str] | None = None) -> FleetRequest:
+    def wait(self, to: str, ids: Iterable[str] | None = None) -> FleetRequestT:
         """Return a request that waits for some or all goals on each robot."""
         return self._send_request(to, Wait(None if ids is None else tuple(ids)))
 
-    def status(self, to: str) -> FleetRequest:
+    def status(self, to: str) -> FleetRequestT:
         """Request the status of each robot's server. Return the request.
 
         The request yields the outcomes. Each outcome contains the status as `said["status"]`.
         """
         return self._send_request(to, Status())
 
-    def pause(self, to: str, seconds: float | None = None) -> FleetRequest:
+    def pause(self, to: str, seconds: float | None = None) -> FleetRequestT:
         """Pause speech on each robot until `resume` is called. Return the request.
 
         If `seconds` is given (0.1 to 86,400), the pause ends after this time.
         """
         return self._send_request(to, Pause(seconds))
 
-    def resume(self, to: str) -> FleetRequest:
+    def resume(self, to: str) -> FleetRequestT:
         """Resume paused speech on each robot. Return the request."""
         return self._send_request(to, Resume())
 
-    def set(self, to: str, **settings: Any) -> FleetRequest:
+    def set(self, to: str, **settings: Any) -> FleetRequestT:
         """Change the settings of each robot's server. Return the request.
 
         The request yields the outcomes. If a robot's bridge doesn't allow this, its outcome is REFUSED. The arguments
         are those of `Client.set`.
         """
         return self._send_request(to, Set(**settings))
+
+    def _send_request(self, to: str, request: Request) -> FleetRequestT:
+        """Return a request to the selected robots."""
+        raise NotImplementedError
+
+
+class Fleet(FleetCalls["FleetRequest"]):
+    """All robots that use the same broker.
+
+    Most methods have an argument `to` that selects robots. It is the name of a robot, a pattern that matches names
+    (`wh-*`), or a group (`@warehouse`). The group `@all` contains every robot.
+
+    These methods return a FleetRequest. Iterate over it to receive the outcomes as they arrive. There is one for each
+    robot, or one for each goal if the request affects several goals. If a robot is offline, its outcome has exit code
+    3, and the robot doesn't receive the request later.
+
+    Each request opens its own connection to the broker, and closes it after the last outcome. To close it earlier, use
+    the FleetRequest in a `with` block or call its `close`. Always exhaust or close the FleetRequest, or the request may
+    not be sent.
+
+    Several threads may use the same Fleet. Only one thread may use a FleetRequest.
+    """
+
+    def robots(self) -> list[Presence]:
+        """Return all robots of the fleet, sorted by name.
+
+        This includes robots that are offline.
+
+        Raises:
+            ServerUnavailable: The broker can't be reached.
+            AccessDenied: The broker rejected the login, or its access rules don't allow the request.
+        """
+        from talkcli.fleet.desk.watch import read_robots
+
+        found = run_blocking(read_robots(self._broker, ANSWER_LIMIT_S, with_status=False))
+        return [each.presence for each in found]
+
+    def robot(self, name: str) -> Client:
+        """Connect to one robot. The returned client works like the client of a local server.
+
+        Raises:
+            ServerUnavailable: The broker can't be reached, or the robot is unknown, offline or without a server.
+            AccessDenied: The broker rejected the login, or its access rules don't allow the request.
+        """
+        from talkcli.fleet.desk.robot import RobotConnection
+
+        return Client.over(run_blocking(RobotConnection.open(name, self._broker, name=self._name)))
 
     def _send_request(self, to: str, request: Request) -> FleetRequest:
         """Send a request to the selected robots. Return the FleetRequest."""

@@ -11,6 +11,7 @@ import talkcli
 from talkcli import aio
 from talkcli.errors import BadOption, ServerUnavailable, UnknownGoal, UsageError
 from tests.support.loop import in_loop
+from tests.support.surroundings import needs_packages
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -31,6 +32,11 @@ TABLE = {
     },
     "GoalHandle": {"awaited": "wait cancel", "iterated": "events feedback", "same": "id state poll request_cancel"},
     "SpeechStream": {"awaited": "write wait", "same": "goal"},
+    "Fleet": {
+        "awaited": "robots",
+        "entered": "robot",
+        "iterated": "say cancel wait status pause resume set",
+    },
 }
 ROWS = [
     (name, kind, method) for name, kinds in TABLE.items() for kind, some in kinds.items() for method in some.split()
@@ -63,6 +69,7 @@ REFUSED: list[tuple[dict[str, Any], type[Exception]]] = [
 
 
 def public(module: ModuleType, name: str) -> set[str]:
+    needs_packages("paho")
     kind = getattr(module, name)
     return {each for each in {*dir(kind), *inspect.get_annotations(kind)} if not each.startswith("_")}
 
@@ -89,8 +96,9 @@ def test_a_method_has_the_parameters_and_defaults_of_the_blocking_one(name: str,
         assert inspect.signature(own).parameters == inspect.signature(model).parameters
 
 
-def test_the_constructors_have_the_same_parameters() -> None:
-    assert inspect.signature(aio.Client) == inspect.signature(talkcli.Client)
+@pytest.mark.parametrize("name", ["Client", "Fleet"])
+def test_the_constructors_have_the_same_parameters(name: str) -> None:
+    assert inspect.signature(getattr(aio, name)) == inspect.signature(getattr(talkcli, name))
 
 
 @pytest.mark.parametrize(("method", "arguments", "error", "words"), ERRORS)

@@ -64,6 +64,8 @@ ERRORS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("doctor", ("now",)),
 )  # fmt: skip
 
+#: The classes that users construct.
+CONSTRUCTED = {"Client", "Fleet"}
 #: A conversation with a server that has the scripted engine. It contains every request, and invalid ones.
 REQUESTS: tuple[dict[str, Any], ...] = (
     {"request": "hello", "name": "golden"},
@@ -170,7 +172,7 @@ def _members(kind: type) -> Iterator[str]:
     if hasattr(kind, "__members__"):
         yield from (f"    {member.name} = {member.value}" for member in kind)  # type: ignore[attr-defined]
         return
-    if "__init__" in vars(kind) and not vars(kind).get("__annotations__"):
+    if kind.__name__ in CONSTRUCTED:
         yield f"    def __init__{inspect.signature(kind.__init__)}"  # type: ignore[misc]
     yield from (f"    {name}: {kind}" for name, kind in inspect.get_annotations(kind).items())
     for name in dir(kind):

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 from talkcli import Client
 from talkcli.errors import Lost, RequestRefused, ServerUnavailable, UnknownGoal
 from talkcli.fleet.broker import from_environment
-from talkcli.fleet.desk.robot import connect_robot
+from talkcli.fleet.desk.robot import RobotConnection
+from talkcli.polling import run_blocking
 from talkcli.protocol.events import Result
 from tests.support.bridge import Desk
 from tests.tools.soak_clients import PATIENCE_S, Workers
@@ -75,7 +76,7 @@ class Ledger:
 
 
 def connect(broker: Broker, robot: str, user: str) -> Connection:
-    return connect_robot(robot, from_environment(broker.env(user, password=False)), name="soak")
+    return run_blocking(RobotConnection.open(robot, from_environment(broker.env(user, password=False)), name="soak"))
 
 
 class Desks:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.fleet.broker import from_environment
 from talkcli.fleet.desk.watch import read_robots
+from talkcli.polling import run_blocking
 from tests.fleet.many import PresenceListener, RealRobots, SimulatedRobots
 from tests.support.bridge import Bridge, Desk
 from tests.support.broker import Broker
@@ -115,7 +116,7 @@ def measure_roster(fleet: MeasuredFleet) -> None:
     broker, times = from_environment(fleet.desk.env), []
     for _ in fleet.rounds:
         started_at = time.monotonic()
-        assert len(read_robots(broker, _LIMIT_S, with_status=False)) == len(fleet.names)
+        assert len(run_blocking(read_robots(broker, _LIMIT_S, with_status=False))) == len(fleet.names)
         times.append(time.monotonic() - started_at)
     _print("all robots, in a program", times)
     _print("`talk fleet status`", [fleet.desk.run("fleet", "status", timeout=_LIMIT_S).seconds for _ in fleet.rounds])

@@ -29,12 +29,13 @@ from talkcli.fleet.link import (
 )
 from talkcli.fleet.payloads import Message
 from talkcli.goals.options import Say
-from talkcli.polling import wait_ready
+from talkcli.polling import block_until_ready
 from talkcli.protocol.lines import request_line, request_to_json
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Collection, Mapping
 
+    from talkcli.polling import WaitReady
     from talkcli.protocol.requests import Request
 
 #: How long a broker or a robot may be absent before open requests count as lost. A bridge reconnects within 15 s after
@@ -52,7 +53,7 @@ _FIRST_BROKER_PAUSE_S, _MAX_BROKER_PAUSE_S = 0.5, 10.0
 class DeskHandler(Protocol):
     """Interface for an object that processes the messages of a DeskLink.
 
-    `DeskLink.poll` calls its methods.
+    `DeskLink.process` calls its methods.
     """
 
     def on_connected(self, link: Link) -> None:
@@ -71,19 +72,23 @@ class DeskHandler(Protocol):
 class DeskLink:
     """A connection to the broker that reconnects when it is lost.
 
-    Only one thread at a time may call `poll`. Any thread may call the other methods.
+    Only one thread at a time may call `prepare`, `process` and the coroutines. Any thread may call the other methods.
     """
 
-    #: the object that processes all messages; must be set before `poll` is first called
+    #: the object that processes all messages; must be set before `prepare` is first called
     handler: DeskHandler
 
-    def __init__(self, broker: Broker) -> None:
-        """Prepare a connection. The first call of `poll` opens it.
+    def __init__(self, broker: Broker, wait: WaitReady = block_until_ready) -> None:
+        """Create a link. `prepare` opens the connection.
+
+        Args:
+            broker: the broker.
+            wait: waits until descriptors are ready. By default, it blocks.
 
         Raises:
             UsageError: The user name can't be part of a topic.
         """
-        self.broker, self.user = broker, client_user(broker)
+        self.broker, self.user, self._wait = broker, client_user(broker), wait
         #: a random part of the reply topics, so that each connection of a user has its own topics
         self.session = os.urandom(8).hex()
         #: the current MQTT connection, or None if there is none
@@ -92,9 +97,11 @@ class DeskLink:
         self.failure: TalkError | None = None
         #: when the marker message came back after the retained messages (monotonic time), or None until then
         self.marker_at: float | None = None
-        #: functions that process messages and rejected requests. `poll` calls them when the link isn't locked.
+        #: functions that process messages and rejected requests. `process` calls them when the link isn't locked.
         self._calls: deque[Callable[[], object]] = deque()
         self._opening: LinkOpener | None = None
+        #: the MQTT connection at the last call of `prepare`
+        self._polled_link: Link | None = None
         self._failed_attempts = 0
         self._next_attempt_at = self._polled_at = time.monotonic()
         # If nobody calls `close`, the garbage collector closes sockets, but not pipes.
@@ -114,7 +121,7 @@ class DeskLink:
         """Return the topic for a robot's replies to this connection."""
         return topics.reply(self.user, self.session, robot)
 
-    def poll(self, timeout: float, interrupt: Mapping[int, int] | None = None) -> bool:
+    async def poll(self, timeout: float, interrupt: Mapping[int, int] | None = None) -> bool:
         """Wait for messages, and pass them to the handler. Return whether data was read.
 
         Reconnect if necessary.
@@ -126,26 +133,42 @@ class DeskLink:
         Returns:
             True if data was read. More data may be waiting, even if no message was complete.
         """
-        link = self.link
         now = time.monotonic()
+        watched, due = self.prepare(now)
+        return self.process(await self._wait(watched, min(timeout, due - now), interrupt))
+
+    def prepare(self, now: float) -> tuple[dict[int, int], float]:
+        """Connect, or keep the connection alive, without blocking. Return what to wait for.
+
+        Returns:
+            The poll events by descriptor, and the monotonic time at which to call `process` even if nothing is ready.
+        """
+        link = self.link
         if link is not None and (link.ended or now - self._polled_at > 2 * KEEPALIVE_S):
             self._disconnect(link)
             link = None
-        due = self._maintain(link, now)
+        due = now + self._maintain(link, now)
+        watched = {self._wake_reader.fileno(): select.POLLIN}
+        if link is not None and link.fileno() >= 0:  # The descriptor is -1 if another thread closed the link.
+            watched[link.fileno()] = select.POLLIN | (select.POLLOUT if link.wants_write else 0)
+        self._polled_link = link
+        return watched, due
+
+    def process(self, ready: Collection[int]) -> bool:
+        """Pass received messages to the handler, without blocking. Return whether data was read.
+
+        `ready` are those of the descriptors from the last call of `prepare` that are ready.
+        """
         wake = self._wake_reader.fileno()
-        watched = {wake: select.POLLIN}
-        descriptor = -1 if link is None else link.fileno()
-        if link is not None and descriptor >= 0:  # The descriptor is -1 if another thread closed the link.
-            watched[descriptor] = select.POLLIN | (select.POLLOUT if link.wants_write else 0)
-        ready = wait_ready(watched, min(timeout, due), interrupt)
         if wake in ready:
             self._wake_reader.recv(4096)
         self._polled_at = time.monotonic()
-        if link is not None and descriptor in ready:
-            link.read()
+        has_data = self._polled_link is not None and bool({*ready} - {wake})
+        if self._polled_link is not None and has_data:
+            self._polled_link.read()
         while self._calls:
             self._calls.popleft()()
-        return descriptor in ready
+        return has_data
 
     def _receive(self, message: Message) -> None:
         """Pass a message to the handler, or record that all retained messages have arrived.
@@ -157,7 +180,7 @@ class DeskLink:
         else:
             self.handler.on_message(message)
 
-    def wait_for_retained(
+    async def wait_for_retained(
         self, timeout: float, is_enough: Callable[[], bool] = lambda: True, interrupt: Mapping[int, int] | None = None
     ) -> None:
         """Wait until the broker has sent its retained messages.
@@ -179,7 +202,7 @@ class DeskLink:
             left = end - time.monotonic()
             if left <= 0:
                 raise self._no_answer_error(timeout)
-            self.poll(left, interrupt)
+            await self.poll(left, interrupt)
 
     def send(
         self, request: Request, number: int, to: str, on_refused: Callable[[TalkError], None], *, is_group: bool = False
@@ -225,16 +248,16 @@ class DeskLink:
         return topic(to, topics.REQUEST, self.user), response
 
     def wake(self) -> None:
-        """Wake up a thread that is waiting in `poll`."""
-        # Sending fails if the link is closed, or if the buffer is full because `poll` has already been woken.
+        """Let a thread or an event loop stop waiting for messages, and call `process`."""
+        # Sending fails if the link is closed, or if the buffer is full because `wake` was called before.
         with contextlib.suppress(OSError):
             self._wake_writer.send(b"\0")
 
-    def flush(self, timeout: float) -> None:
+    async def flush(self, timeout: float) -> None:
         """Wait until the broker has acknowledged all messages, but for at most `timeout` seconds."""
         end = time.monotonic() + timeout
         while self.link is not None and self.link.outstanding_bytes and (left := end - time.monotonic()) > 0:
-            self.poll(left)
+            await self.poll(left)
 
     def close(self, *, forked: bool = False) -> None:
         """Close the connection for good. In a forked child, only close the child's descriptors.

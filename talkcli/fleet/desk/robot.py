@@ -32,14 +32,15 @@ from talkcli.fleet.desk.request import NoServer, RobotOffline
 from talkcli.fleet.link import Link, boottime
 from talkcli.frozen import replace
 from talkcli.goals.options import Append, Cancel, Pause, Say, Set
-from talkcli.polling import wait_ready
 from talkcli.protocol.events import check_greeting
 from talkcli.protocol.lines import decode
 from talkcli.protocol.requests import Hello, Request, Resume, Wait
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Collection, Iterator, Mapping
+
+    from typing_extensions import Self
 
     from talkcli.fleet.broker import Broker
     from talkcli.fleet.payloads import Message
@@ -125,16 +126,49 @@ class RobotConnection(Connection):
         #: queued lookups of goals, which are sent when earlier ones have been answered
         self._lookups: deque[Exchange] = deque()
 
+    @classmethod
+    async def open(cls, robot: str, broker: Broker, *, keep_trying_s: float = 0.0, **options: Any) -> Self:
+        """Connect to a robot's server through the broker. Return the connection.
+
+        Args:
+            robot: the name of the robot.
+            broker: the broker that the robot's bridge uses.
+            keep_trying_s: how long to keep trying in seconds if the broker can't be reached or the robot is offline.
+            options: other arguments of `RobotConnection`.
+
+        Raises:
+            ServerUnavailable: The broker can't be reached, or the robot is unknown, offline or without a server.
+            AccessDenied: The broker rejected the login, or its certificate is not trusted.
+            UsageError: The name of the robot or the sender is not allowed.
+        """
+        give_up = time.monotonic() + keep_trying_s
+        while True:
+            desk = DeskLink(broker, cls.wait)
+            try:
+                desk.handler = connection = cls(robot, desk, **options)
+                await connection.wait_online(give_up)
+                return connection
+            except BaseException as error:
+                desk.close()
+                left = give_up - time.monotonic()
+                if not isinstance(error, ServerUnavailable) or left <= 0:
+                    raise
+            await cls.wait({}, min(_CONNECT_PAUSE_S, left), options.get("interrupt"))
+
     # -- requests
 
     def _send(self, exchange: Exchange) -> None:
         """Send a request now, or once the robot is back. A goal is given an id and an expiry time."""
         request = exchange.request
         if isinstance(request, Say) and isinstance(exchange, RobotExchange):
-            exchange.request = replace(request, id=request.id or new_goal_id(self._desk))
+            exchange.request = replace(request, id=request.id or self.new_goal_id())
             exchange.expires_at = boottime() + request.ttl if request.ttl else None
         if not self._publish(exchange):
             self._desk.wake()  # The request will be sent when the robot is back.
+
+    def new_goal_id(self) -> str:
+        """Return a new random id for a goal that this client sends."""
+        return new_goal_id(self._desk)
 
     def expect_reply(self, exchange: RobotExchange) -> None:
         """Expect the robot's answer to a request that was sent to its group."""
@@ -207,10 +241,14 @@ class RobotConnection(Connection):
 
     # -- messages from the robot
 
-    def _step(self, timeout: float, interruptible: bool) -> None:
-        """Keep the bridge's session alive, and process messages for up to `timeout` seconds."""
+    def prepare(self, now: float) -> tuple[dict[int, int], float]:
+        """Keep the bridge's session alive. Return the descriptors to wait for, and when to call `process`."""
         self.keep_alive()
-        self._desk.poll(timeout, self._interrupt if interruptible else None)
+        return self._desk.prepare(now)
+
+    def process(self, ready: Collection[int]) -> None:
+        """Process the messages from the broker."""
+        self._desk.process(ready)
 
     def keep_alive(self) -> None:
         """Send a message to keep the bridge's session alive, unless another was sent recently."""
@@ -266,15 +304,15 @@ class RobotConnection(Connection):
 
     # -- connecting
 
-    def wait_online(self, give_up: float) -> None:
+    async def wait_online(self, give_up: float) -> None:
         """Wait until the robot can receive requests. Raise an error if it can't by `give_up`.
 
-        `give_up` is a monotonic time. The errors are the same as those of `connect_robot`.
+        `give_up` is a monotonic time. The errors are the same as those of `open`.
         """
         left = self._patience if self._end is None else max(0.0, self._end - time.monotonic())
-        self._desk.wait_for_retained(min(self._patience, left), lambda: bool(self._presence), self._interrupt)
+        await self._desk.wait_for_retained(min(self._patience, left), lambda: bool(self._presence), self._interrupt)
         while self.absent_since is not None and self._desk.link and (left := give_up - time.monotonic()) > 0:
-            self._desk.poll(left, self._interrupt)
+            await self._desk.poll(left, self._interrupt)
         self._patience = max(self._patience, round(give_up - time.monotonic(), 1))
         if not self._presence:
             words = f"no robot '{self.robot}' is known at {self._desk.broker.url}, so nothing was sent"
@@ -402,35 +440,6 @@ class RobotConnection(Connection):
     def _drop(self) -> None:
         """Close the connection to the broker. In a forked child, only close the child's descriptors."""
         self._desk.close(forked=os.getpid() != self._process)
-
-
-def connect_robot(robot: str, broker: Broker, *, keep_trying_s: float = 0.0, **options: Any) -> RobotConnection:
-    """Connect to a robot's server through the broker. Return the connection.
-
-    Args:
-        robot: the name of the robot.
-        broker: the broker that the robot's bridge uses.
-        keep_trying_s: how long to keep trying in seconds if the broker can't be reached or the robot is offline.
-        options: other arguments of `RobotConnection`.
-
-    Raises:
-        ServerUnavailable: The broker can't be reached, or the robot is unknown, offline or without a server.
-        AccessDenied: The broker rejected the login, or its certificate is not trusted.
-        UsageError: The name of the robot or the sender is not allowed.
-    """
-    give_up = time.monotonic() + keep_trying_s
-    while True:
-        desk = DeskLink(broker)
-        try:
-            desk.handler = connection = RobotConnection(robot, desk, **options)
-            connection.wait_online(give_up)
-            return connection
-        except BaseException as error:
-            desk.close()
-            left = give_up - time.monotonic()
-            if not isinstance(error, ServerUnavailable) or left <= 0:
-                raise
-        wait_ready({}, min(_CONNECT_PAUSE_S, left), options.get("interrupt"))
 
 
 def new_goal_id(desk: DeskLink) -> str:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.client.calls import batches, check, check_id, too_long
 from talkcli.client.connect import ANSWER_LIMIT_S
-from talkcli.client.goal import GoalHandle
+from talkcli.client.goal import GoalHandle, end_time
 from talkcli.errors import EXIT_OK, Lost, ServerUnavailable, TalkError, UnknownGoal, Unreadable, UsageError
 from talkcli.fleet import topics
 from talkcli.fleet.desk.link import DeskLink
@@ -26,14 +26,17 @@ from talkcli.frozen import replace
 from talkcli.goals.goal import Goal, JsonObject
 from talkcli.goals.options import Cancel, Say, Set, key_error
 from talkcli.goals.states import State
+from talkcli.polling import block_until_ready, run_blocking
 from talkcli.protocol.events import goals
 from talkcli.protocol.lines import FIRST_SEQ
 from talkcli.protocol.requests import Request, Status, Wait
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
+    from typing import Any
 
     from talkcli.fleet.broker import Broker
+    from talkcli.polling import WaitReady
 
 #: The default ttl of a sentence. It prevents a robot from saying something that was only true a minute ago.
 DEFAULT_TTL_S = 10.0
@@ -46,12 +49,8 @@ _MAX_MESSAGES_PER_CHECK = 5000
 _FLUSH_LIMIT_S = 1.0
 
 
-class FleetRequest:
-    """A request to several robots. Iterate over it to receive the outcomes as they arrive.
-
-    The connection to the broker is closed after the last outcome, by `close`, or at the end of a `with` block. This
-    doesn't cancel the request. Only one thread may use this object.
-    """
+class FleetRequestCalls:
+    """The base class of requests to several robots, with coroutines for the calls that wait."""
 
     def __init__(
         self,
@@ -62,8 +61,9 @@ class FleetRequest:
         name: str | None = None,
         interrupt: Mapping[int, int] | None = None,
         patience_s: float = ANSWER_LIMIT_S,
+        wait: WaitReady = block_until_ready,
     ) -> None:
-        """Connect to the broker, and send the request.
+        """Check and prepare a request, without connecting to the broker.
 
         Args:
             broker: the broker of the fleet.
@@ -72,12 +72,11 @@ class FleetRequest:
             name: the name of the sender. The default is TALK_NAME.
             interrupt: file descriptors that interrupt any wait, as in `wait_ready`.
             patience_s: the time in seconds within which the broker and each robot must answer.
+            wait: waits until descriptors are ready. By default, it blocks.
 
         Raises:
             UsageError: The selection or the request is not valid.
             UnknownGoal: The request contains an invalid goal id.
-            ServerUnavailable: The broker can't be reached.
-            AccessDenied: The broker rejected the login, or its access rules don't allow the request.
         """
         if selection.fault:
             raise UsageError(selection.fault)
@@ -100,32 +99,16 @@ class FleetRequest:
         self._closed = False
         #: the id of the goal that `cancel` has cancelled, or None if `cancel` hasn't been called
         self._canceled_id: str | None = None
-        self._desk = DeskLink(broker)
+        #: when to check for late robots the next time (monotonic time)
+        self._next_check = 0.0
+        self._desk = DeskLink(broker, wait)
         self._desk.handler = self
-        try:
-            if isinstance(request, Say):
-                ttl = DEFAULT_TTL_S if request.ttl is None else request.ttl
-                request = replace(request, id=request.id or new_goal_id(self._desk), ttl=ttl)
-            self.request = request
-            #: the rejected goal, if the text is too long for any server. In that case, the request isn't sent.
-            self._rejected = too_long(request) if isinstance(request, Say) else None
-            self._desk.wait_for_retained(patience_s, interrupt=interrupt)
-            #: when the sentence expires (by the `boottime` clock), or None if it never does
-            self._expires_at = boottime() + request.ttl if isinstance(request, Say) and request.ttl else None
-            self._began = True
-            self._send_to_known_robots()
-        except BaseException:
-            self.close()
-            raise
-
-    def __enter__(self) -> FleetRequest:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def __iter__(self) -> Iterator[Outcome]:
-        return self.results()
+        if isinstance(request, Say):
+            ttl = DEFAULT_TTL_S if request.ttl is None else request.ttl
+            request = replace(request, id=request.id or new_goal_id(self._desk), ttl=ttl)
+        self.request = request
+        #: the rejected goal, if the text is too long for any server. In that case, the request isn't sent.
+        self._rejected = too_long(request) if isinstance(request, Say) else None
 
     def __len__(self) -> int:
         """Return the number of selected robots found so far, including offline robots."""
@@ -141,46 +124,48 @@ class FleetRequest:
         """An error message while the broker is disconnected, otherwise None."""
         return None if self._desk.link else f"the connection to the broker at {self._desk.broker.url} was lost"
 
-    def results(self, timeout: float | None = None) -> Iterator[Outcome]:
-        """Yield the outcomes as they arrive.
-
-        Raises TimeoutError if some are missing after `timeout` seconds.
-
-        After a TimeoutError or Interrupted, call this again to receive the remaining outcomes.
-
-        Args:
-            timeout: the time limit for all outcomes in seconds, or None for no limit.
+    async def _start(self) -> None:
+        """Connect to the broker, and send the request, unless this was done before.
 
         Raises:
-            TimeoutError: Not all outcomes have arrived in time.
-            Interrupted: One of the `interrupt` descriptors is ready.
-            ServerUnavailable: No robot matches the selection.
-            AccessDenied: The broker's access rules don't allow requests to the group.
+            ServerUnavailable: The broker can't be reached.
+            AccessDenied: The broker rejected the login, or its access rules don't allow the request.
         """
-        end = None if timeout is None else time.monotonic() + timeout
-        next_check = time.monotonic() + _CHECK_INTERVAL_S
-        while True:
-            while self._outcomes:
-                yield self._outcomes.popleft()
-            if self._closed:
-                return
+        if self._began or self._closed:
+            return
+        try:
+            await self._desk.wait_for_retained(self._patience, interrupt=self._interrupt)
+            ttl = self.request.ttl if isinstance(self.request, Say) else None
+            #: when the sentence expires (by the `boottime` clock), or None if it never does
+            self._expires_at = boottime() + ttl if ttl else None
+            self._began, self._next_check = True, time.monotonic() + _CHECK_INTERVAL_S
+            self._send_to_known_robots()
+        except BaseException:
+            await self._close()
+            raise
+
+    async def _next_outcome(self, end: float | None, timeout: float | None) -> Outcome | None:
+        """Return the next outcome, or None after the last one. Raise TimeoutError if `end` (monotonic) passes first."""
+        await self._start()
+        while not (self._outcomes or self._closed):
             if self._refused is not None:
-                self.close()
+                await self._close()
                 raise self._refused
             self._complete = self._complete or self._desk.retained_received
             if self._complete and not self._unfinished:
-                self.close()
-                break
+                await self._close()
+                if not len(self):
+                    raise self._no_robot_error()
+                return None
             now = time.monotonic()
             if end is not None and now >= end:
                 done = len(self) - len(self._unfinished)
                 raise TimeoutError(f"{done} of {len(self)} robots have finished after {round(timeout or 0.0, 1):g} s")
-            self._desk.poll(min(next_check, end or next_check) - now, self._interrupt)
-            if time.monotonic() >= next_check:
-                self._check_for_late_robots()
-                next_check = time.monotonic() + _CHECK_INTERVAL_S
-        if not len(self):
-            raise self._no_robot_error()
+            await self._desk.poll(min(self._next_check, end or self._next_check) - now, self._interrupt)
+            if time.monotonic() >= self._next_check:
+                await self._check_for_late_robots()
+                self._next_check = time.monotonic() + _CHECK_INTERVAL_S
+        return self._outcomes.popleft() if self._outcomes else None
 
     def cancel(self) -> None:
         """Cancel the sentence on all robots that haven't finished it.
@@ -189,12 +174,14 @@ class FleetRequest:
         If the request isn't a sentence, this method has no effect.
 
         Raises:
-            UsageError: All outcomes have been returned. Cancel the goal by its id instead.
+            UsageError: The request has not been sent, or all outcomes have been returned. In the second case, cancel
+                the goal by its id.
         """
         if not isinstance(self.request, Say):
             return
-        if self._closed:
-            raise UsageError("this request has ended; to cancel its goal, use the goal's id")
+        if not self._began:
+            why = "has ended; to cancel its goal, use the goal's id" if self._closed else "has not been sent"
+            raise UsageError(f"this request {why}")
         goal_id = self._canceled_id = str(self.request.id)
         group = self._selection.group
         if group is not None:
@@ -205,11 +192,11 @@ class FleetRequest:
             is_sent = group is not None and robot.presence is not None and self._selection.includes(robot.presence)
             robot.connection.cancel_after_absence(goal_id, also_now=not is_sent)
 
-    def close(self) -> None:
+    async def _close(self) -> None:
         """Send all queued messages, and close the connection. This doesn't cancel the request."""
         began, self._began, self._closed = self._began, False, True
         if began:
-            self._desk.flush(_FLUSH_LIMIT_S)
+            await self._desk.flush(_FLUSH_LIMIT_S)
             if self._selection.group is not None:
                 self._desk.end_session(self._selection.group, is_group=True)
             else:
@@ -233,10 +220,10 @@ class FleetRequest:
         """Store the error for a rejected message to the group. `results` raises this error."""
         self._refused = error
 
-    def _check_for_late_robots(self) -> None:
+    async def _check_for_late_robots(self) -> None:
         """Process all waiting messages, and record a failure for each robot that is late."""
         for _ in range(_MAX_MESSAGES_PER_CHECK):
-            if not self._desk.poll(0.0, self._interrupt):
+            if not await self._desk.poll(0.0, self._interrupt):
                 break
         for name in list(self._unfinished):
             self._record_ended_goals(name, fail_if_late=True)
@@ -342,6 +329,61 @@ class FleetRequest:
         """Store outcomes for `results` to yield. A robot is finished after its last outcome."""
         self._outcomes += outcomes
         self._unfinished -= {each.robot for each in outcomes if each.last}
+
+
+class FleetRequest(FleetRequestCalls):
+    """A request to several robots. Iterate over it to receive the outcomes as they arrive.
+
+    The connection to the broker is closed after the last outcome, by `close`, or at the end of a `with` block. This
+    doesn't cancel the request. Only one thread may use this object.
+    """
+
+    def __init__(self, broker: Broker, selection: Selection, request: Request, **options: Any) -> None:
+        """Connect to the broker, and send the request.
+
+        The arguments are those of `FleetRequestCalls`.
+
+        Raises:
+            UsageError: The selection or the request is not valid.
+            UnknownGoal: The request contains an invalid goal id.
+            ServerUnavailable: The broker can't be reached.
+            AccessDenied: The broker rejected the login, or its access rules don't allow the request.
+        """
+        super().__init__(broker, selection, request, **options)
+        run_blocking(self._start())
+
+    def __enter__(self) -> FleetRequest:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator[Outcome]:
+        return self.results()
+
+    def results(self, timeout: float | None = None) -> Iterator[Outcome]:
+        """Yield the outcomes as they arrive.
+
+        Raises TimeoutError if some are missing after `timeout` seconds.
+
+        After a TimeoutError or Interrupted, call this again to receive the remaining outcomes.
+
+        Args:
+            timeout: the time limit for all outcomes in seconds, or None for no limit.
+
+        Raises:
+            TimeoutError: Not all outcomes have arrived in time.
+            Interrupted: One of the `interrupt` descriptors is ready.
+            ServerUnavailable: No robot matches the selection.
+            AccessDenied: The broker's access rules don't allow requests to the group.
+        """
+        end = end_time(timeout)
+        while (outcome := run_blocking(self._next_outcome(end, timeout))) is not None:
+            yield outcome
+
+    def close(self) -> None:
+        """Send all queued messages, and close the connection. This doesn't cancel the request."""
+        run_blocking(self._close())
 
 
 class RobotRequest:

@@ -18,11 +18,13 @@ from talkcli.fleet.desk.link import ABSENCE_LIMIT_S, DeskLink
 from talkcli.fleet.payloads import Message, Presence, RobotInfo, RobotStatus
 from talkcli.frozen import frozen
 from talkcli.goals.states import State
+from talkcli.polling import run_blocking
 from talkcli.protocol.events import PausedChanged, StateChanged, from_json
 from talkcli.protocol.lines import decode
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterator, Mapping
+    from typing import Any
 
     from talkcli.fleet.broker import Broker
     from talkcli.fleet.desk.request import Selection
@@ -96,8 +98,8 @@ class BrokerBack:
 FleetEvent = FleetSnapshot | RobotChanged | RobotEvent | EventsMissed | BrokerAway | BrokerBack
 
 
-def read_robots(
-    broker: Broker, timeout: float, name: str | None = None, *, with_status: bool = True
+async def read_robots(
+    broker: Broker, timeout: float, name: str | None = None, *, with_status: bool = True, **options: Any
 ) -> list[RobotInfo]:
     """Read the presence and status of a fleet's robots from the broker, sorted by name.
 
@@ -108,6 +110,7 @@ def read_robots(
         timeout: the time in seconds within which the broker must answer.
         name: the name of a robot, to return only this one.
         with_status: whether to read the status of the robots, too.
+        options: other arguments of `DeskLink`.
 
     Raises:
         ServerUnavailable: The broker can't be reached, or doesn't answer in time.
@@ -115,10 +118,10 @@ def read_robots(
     """
     kinds = (topics.PRESENCE, topics.STATUS) if with_status else (topics.PRESENCE,)
     reader = _RetainedReader([topics.robot(name or topics.ANY, each) for each in kinds])
-    desk = DeskLink(broker)
+    desk = DeskLink(broker, **options)
     desk.handler = reader
     try:
-        desk.wait_for_retained(timeout, lambda: bool(reader.messages))
+        await desk.wait_for_retained(timeout, lambda: bool(reader.messages))
     finally:
         desk.close()
     return _read_states(reader.messages)
@@ -197,7 +200,7 @@ class FleetWatch:
             Lost: The connection to the broker was lost later, and the broker wasn't back in time.
         """
         try:
-            self._desk.wait_for_retained(ANSWER_LIMIT_S, lambda: False, interrupt)
+            run_blocking(self._desk.wait_for_retained(ANSWER_LIMIT_S, lambda: False, interrupt))
             self._process_retained(self._retained or [], time.monotonic(), first=True)
             while True:
                 now = time.monotonic()
@@ -206,7 +209,7 @@ class FleetWatch:
                 self._check_time_limits(now)
                 while self._events:
                     yield self._events.popleft()
-                self._desk.poll(_LIMIT_CHECK_INTERVAL_S, interrupt)
+                run_blocking(self._desk.poll(_LIMIT_CHECK_INTERVAL_S, interrupt))
         finally:
             self._desk.close()
 

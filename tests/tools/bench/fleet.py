@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 from talkcli import Client, State
 from talkcli.fleet.broker import from_environment
-from talkcli.fleet.desk.robot import connect_robot
+from talkcli.fleet.desk.robot import RobotConnection
+from talkcli.polling import run_blocking
 from talkcli.protocol.events import StateChanged
 from tests.support.bridge import Bridge, Desk
 from tests.support.broker import Broker
@@ -89,7 +90,7 @@ def _robot(*, secure: bool = False) -> Iterator[tuple[Talk, Bridge, dict[str, st
 
 
 def _connect(env: dict[str, str]) -> Client:
-    return Client.over(connect_robot(_ROBOT, from_environment(env), name="bench"))
+    return Client.over(run_blocking(RobotConnection.open(_ROBOT, from_environment(env), name="bench")))
 
 
 def _time_say(client: Client) -> float:
