@@ -41,7 +41,7 @@ _NOT_A_TIME = {
 #: The words for a day, with the number of days before today. Without a word, it is today.
 _DAYS_AGO = {"": 0, "today": 0, "yesterday": 1}
 #: Options that can't be used with several robots.
-_SINGLE_ROBOT_OPTIONS = ("lines", "ahead", "stream", "feedback", "output", "list")
+_SINGLE_ROBOT_OPTIONS = ("lines", "ahead", "stream", "feedback", "output", "list", "pronounce", "dry_run")
 
 #: All exit codes, for `talk --help`. The help of some commands describes them more specifically.
 ALL_EXIT_CODES: ExitCodes = {
@@ -132,7 +132,7 @@ class Command:
         if values.get("while_connected"):
             return "--while only works on this machine, because a broker can't tell when a program ends; use --for"
         if selects_several(selection):
-            single = [f"--{each}" for each in _SINGLE_ROBOT_OPTIONS if values.get(each)]
+            single = [f"--{each.replace('_', '-')}" for each in _SINGLE_ROBOT_OPTIONS if values.get(each)]
             if single or not self.fleet_function:
                 what = " ".join([self.name, *single])
                 return f"'talk {what}' only works with one robot; name it, or try 'talk fleet status' for several"

@@ -64,11 +64,20 @@ def _say_options() -> Iterator[Option]:
     yield option("--stream", FLAG, "Speak standard input as one text, while it arrives.")
     words = "Write the speech to a WAV file. '-' means standard output. No server is needed."
     yield option("-o, --output", OUTPUT_FILE, words, metavar="FILE.wav")
+    words = "With --output, say words as FILE defines. For other sentences, use 'talk serve --pronounce FILE'."
+    yield option("--pronounce", PATH, words, metavar="FILE", completion="files")
 
 
 _SAY_OPTIONS = tuple(_say_options())
 #: Options of `say` that can be combined with --output.
-_SERVERLESS_OPTIONS = {"timeout", "output", "format", *(each.name for each in goal_options.SOUND_OPTIONS)}
+_SERVERLESS_OPTIONS = {
+    "timeout",
+    "output",
+    "pronounce",
+    "format",
+    "dry_run",
+    *(each.name for each in goal_options.SOUND_OPTIONS),
+}
 #: File extensions of audio formats other than WAV.
 _OTHER_EXTENSIONS = (".aac", ".aiff", ".au", ".flac", ".m4a", ".mp3", ".mp4", ".oga", ".ogg", ".opus", ".webm", ".wma")
 
@@ -84,6 +93,10 @@ def _say_fault(values: Mapping[str, Any], typed: frozenset[str]) -> str | None:
         if extension.lower() in _OTHER_EXTENSIONS:
             return "--output can only write WAV files; name the file .wav, and convert it with ffmpeg or sox"
         return _input_fault(values, typed)
+    if values["pronounce"] is not None:
+        return "--pronounce only works with --output; for other sentences, use: talk serve --pronounce FILE"
+    if values["dry_run"] and (values["lines"] or values["stream"]):
+        return "--dry-run prints a single text; leave out --lines and --stream"
     return _input_fault(values, typed) or _goal_fault(values)
 
 
@@ -125,7 +138,7 @@ def _play_options() -> Iterator[Option]:
 
 
 #: Options of `say` for texts and words, in addition to those that are `speech_only`.
-_TEXT_OPTIONS = {"feedback", "format", "lines", "ahead", "stream", "output"}
+_TEXT_OPTIONS = {"feedback", "format", "lines", "ahead", "stream", "output", "pronounce"}
 _PLAY_OPTIONS = tuple(_play_options())
 
 
@@ -197,6 +210,13 @@ _SERVE_OPTIONS = (
         "is in the state directory, or in FILE, whose path contains '/'.",
         metavar="[no-text|FILE]",
         bare_value=TEXT_HISTORY,
+    ),
+    option(
+        "--pronounce",
+        PATH,
+        "Say words as FILE defines. It has lines such as 'GmbH = gay em bay ha'. A changed file is read again.",
+        metavar="FILE",
+        completion="files",
     ),
     option("--socket-mode", FILE_MODE, "Set the socket's file mode, which decides who may connect.", default="0600"),
     option("--greeting", TEXT, "Speak this sentence when the server starts."),
@@ -291,6 +311,7 @@ _ROWS = (
         llm | talk say --stream --wait
         talk say -o hello.wav "hello"           needs no server
         talk say -o - "hello" | aplay
+        talk say --dry-run "hello"              prints the text as it would be said
         """,
         exit_codes={
             0: "accepted, or skipped by --throttle; with --wait: played to the end",

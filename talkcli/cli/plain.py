@@ -154,11 +154,14 @@ def run(parsed: PlainCommand) -> int:
 def may_send_early(parsed: PlainCommand) -> bool:
     """Return whether the request may be sent before the rest of the program is imported.
 
-    The command must use the local server, and must not need standard input, which may take any time to arrive.
+    The command must use the local server, and must not need standard input, which may take any time to arrive. Dry runs
+    have time.
     """
     if named_robot(parsed.common.get("robot"), parsed.common.get("socket")):
         return False
     given = parsed.given
+    if given.get("dry_run"):
+        return False
     reads_input = given.get("lines") or given.get("stream") or given.get("text") == ("-",) or given.get("list")
     return parsed.command.name in _EARLY_COMMANDS and not reads_input
 

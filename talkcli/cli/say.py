@@ -22,9 +22,11 @@ from talkcli.cli.show import (
 from talkcli.cli.wait import GoalReporter, seconds_left, timeout_error
 from talkcli.errors import EXIT_OK, Lost, UsageError
 from talkcli.frozen import TYPE_CHECKING
+from talkcli.goals.goal import Goal
 from talkcli.goals.options import MARKDOWN, SOUND, SOUND_OPTIONS, STALL_S
 from talkcli.goals.states import State
 from talkcli.polling import Interrupted
+from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
 
     from talkcli.cli.show import CommonOptions
     from talkcli.client.client import GoalHandle
+    from talkcli.engine.pronunciation import Pronunciations
 
 
 def say(
@@ -46,6 +49,8 @@ def say(
     stream: bool,
     stall: float,
     output: str | None,
+    pronounce: str | None,
+    dry_run: bool,
     **goal_options: Any,
 ) -> int:
     """Speak a text or standard input, or write the speech to a file.
@@ -64,6 +69,8 @@ def say(
         stream: whether to speak standard input as one goal while it arrives.
         stall: with `stream`, how long the goal waits for more text.
         output: the file to write, or None to speak.
+        pronounce: with `output`, the file of pronunciations, or None.
+        dry_run: whether to print the text as it would be said, instead of speaking it.
         goal_options: the options of the goal.
     """
     wait = wait or feedback
@@ -80,8 +87,9 @@ def say(
     if isinstance(found, int):
         return found  # nothing can be spoken
     sentence = replace_and_report_bad_bytes(found, options)
-    if output is not None:
-        return _write_wav_file(output, sentence, goal_options, timeout, options)
+    if output is not None or dry_run:
+        act = _print_dry_run if dry_run else _write_wav_file
+        return act(output or "", sentence, goal_options, timeout, options, pronounce)
     with Interrupts(blocked=options.blocked_signals, output=wait) as interrupts:
         try:
             with options.connect(timeout, name=name, interrupt=interrupts.watched) as client:
@@ -110,13 +118,12 @@ def play(options: CommonOptions, sound: str, list: bool, **given: Any) -> int:  
     `given` contains the other options, which are explained in `say`.
     """
     if list:
-        from talkcli.terminal.text import printable
-
         with options.connect() as client:
             names = client.sounds()
         show_result(options, [{"name": each} for each in names], lambda: map(printable, names))
         return EXIT_OK
     given |= {"feedback": False, "lines": False, "ahead": None, "stream": False, "stall": STALL_S, "output": None}
+    given |= {"pronounce": None, "dry_run": False}
     return say(options, (sound,), format=SOUND, **given)
 
 
@@ -155,8 +162,52 @@ def _report_sent(goal: GoalHandle, options: CommonOptions, reporter: GoalReporte
     return reporter.report(goal.goal)
 
 
+def _print_dry_run(
+    path: str,
+    text: str,
+    goal_options: Mapping[str, Any],
+    timeout: float | None,
+    options: CommonOptions,
+    pronounce: str | None,
+) -> int:
+    """Print a text as it would be said, or why it would be rejected. Return the exit code.
+
+    The server is asked, unless the text would be written to a file.
+    """
+    if path:
+        from talkcli.engine.parent.render import check_text
+
+        check_text(text, timeout=seconds_left(options.deadline(timeout)), **_sound_settings(goal_options))
+        text_format = goal_options["format"]
+        said = _read_pronunciations(pronounce, options).apply_to_goal(text, text_format).for_people(text_format)
+        goal = Goal("", State.PENDING, text, format=text_format, said=None if said == text else said)
+    else:
+        with options.connect(timeout) as client:
+            goal = client.dry_run(text, **goal_options)
+        if goal.state is State.REJECTED:
+            return GoalReporter(options, feedback=False).report_refused(goal)
+    said = goal.text or "" if goal.said is None else goal.said
+    show_result(options, [goal.to_json()], lambda: map(printable, said.splitlines()))
+    return EXIT_OK
+
+
+def _read_pronunciations(path: str | None, options: CommonOptions) -> Pronunciations:
+    """Read a file of pronunciations, if there is one. Print a message about each faulty line."""
+    from talkcli.engine.pronunciation import PronunciationFile, Pronunciations
+
+    file = PronunciationFile(path) if path else None
+    for fault in file.describe_faults() if file and not options.quiet else ():
+        note(printable(fault))
+    return file.table if file else Pronunciations({})
+
+
 def _write_wav_file(
-    path: str, text: str, goal_options: Mapping[str, Any], timeout: float | None, options: CommonOptions
+    path: str,
+    text: str,
+    goal_options: Mapping[str, Any],
+    timeout: float | None,
+    options: CommonOptions,
+    pronounce: str | None,
 ) -> int:
     """Write a text's speech to a WAV file, or to standard output for "-". Return the exit code."""
     from talkcli.engine.parent.render import STANDARD_OUTPUT, render
@@ -167,10 +218,17 @@ def _write_wav_file(
         if options.json:
             raise UsageError("--json and -o - both write to standard output; leave out one of them")
         standard_output()
+    pronunciations = _read_pronunciations(pronounce, options)
     with Interrupts() as interrupts:
         try:
             seconds = render(
-                text, path, timeout=seconds_at_most, interrupt=interrupts.watched, markdown=markdown, **settings
+                text,
+                path,
+                timeout=seconds_at_most,
+                interrupt=interrupts.watched,
+                markdown=markdown,
+                pronunciations=pronunciations,
+                **settings,
             )
         except Interrupted:
             return interrupts.exit_code

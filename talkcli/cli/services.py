@@ -23,6 +23,7 @@ from talkcli.cli.command import FILE_MODE, long_flag, nearest
 from talkcli.cli.commands import COMMANDS
 from talkcli.cli.show import note, show
 from talkcli.errors import EXIT_OK, UsageError
+from talkcli.goals.options import PATH
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
@@ -45,6 +46,16 @@ _STATE_DIRECTORY = "# The history of goals.\nStateDirectory=talk\nStateDirectory
 _UNSAFE_CHARACTERS = "[\0-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]"
 #: Directories that systemd's ProtectHome= setting hides.
 _HOME_DIRECTORIES = ("/home/", "/root/", "/run/user/")
+#: Directories to which the system-wide server can write.
+_WRITABLE_DIRECTORIES = ("/run/talk/", "/var/cache/talk/")
+#: What to do if the system-wide service can't use the path in an option, and in any other option.
+_HIDDEN_PATH_ADVICE = {
+    "--socket": "choose a path in /run/talk",
+    "--history": "leave out the path, so that the history is in /var/lib/talk",
+    "--player file:": "choose a file in /run/talk",
+}
+_WRITING_OPTIONS = ("--history", "--player file:")
+_LET_READ = "copy it into /etc/talk, and let everybody read it"
 
 
 def serve(options: CommonOptions, print_unit: str | None, **given: Any) -> int:
@@ -55,8 +66,9 @@ def serve(options: CommonOptions, print_unit: str | None, **given: Any) -> int:
     history = given["history"] or ""
     if "/" in history:
         given["history"] = os.path.abspath(history)
-    if given["sounds"]:
-        given["sounds"] = os.path.abspath(given["sounds"])
+    for name in ("sounds", "pronounce"):
+        if given[name]:
+            given[name] = os.path.abspath(given[name])
     if print_unit:
         mode, words = given["socket_mode"], []
         if print_unit.startswith("system") and "socket_mode" not in options.typed:
@@ -160,15 +172,24 @@ def _print_unit(
     program = _find_program(sys.argv[0])
     # The program's script, interpreter and package must all be accessible.
     files = (program[0], *map(os.path.realpath, (program[0], sys.executable, __file__)))
+    home = "read-only" if any(each.startswith(_HOME_DIRECTORIES) for each in files) else "yes"
     unit = _read_template(f"{command}-{kind}").format(
         command=" ".join(map(_quote_argument, (*program, command, *arguments, *socket_option, *typed))),
-        home="read-only" if any(each.startswith(_HOME_DIRECTORIES) for each in files) else "yes",
+        home=home,
         socket=escape(socket) if socket else usual_socket,
         **values,
     )
     show(unit.rstrip("\n"))
-    hidden = _find_inaccessible_file(files) if kind == "system" else None
-    if hidden:
+    if kind != "system":
+        return EXIT_OK
+    named = {long_flag(each): given[each.name] for each in row.options if each.kind is PATH}
+    player, colon, file = (given.get("player") or "").partition("file:")
+    named |= {"--socket": socket, "--player file:": colon and os.path.abspath(file), "--player": player.split(" ")[0]}
+    for flag, path in named.items():
+        problem = _find_hidden_path(flag, path or "", hides_home=home == "yes")
+        if problem:
+            note(f"{flag} names {printable(path)}, but {problem}; {_HIDDEN_PATH_ADVICE.get(flag, _LET_READ)}")
+    if hidden := _find_inaccessible_file(files):
         file, directory = hidden
         note(
             f"talk needs {printable(file)}, but the service's user can't enter {printable(directory)}; install "
@@ -196,6 +217,27 @@ def _format_option(option: Option, value: object) -> str:
     if value is True or value == option.bare_value is not None:
         return long_flag(option)
     return f"{long_flag(option)}={value:04o}" if option.kind is FILE_MODE else f"{long_flag(option)}={value}"
+
+
+def _find_hidden_path(flag: str, path: str, *, hides_home: bool) -> str | None:
+    """Return why the system-wide service can't use the path in an option, or None if it can.
+
+    Args:
+        flag: the option.
+        path: its value. Only absolute paths are checked.
+        hides_home: whether the unit hides home directories.
+    """
+    if path.startswith(("/tmp/", "/var/tmp/")):
+        return "the service has a /tmp of its own (PrivateTmp=)"
+    if hides_home and path.startswith(_HOME_DIRECTORIES):
+        return "the unit hides home directories (ProtectHome=)"
+    if flag in _WRITING_OPTIONS and path.startswith("/") and not path.startswith(_WRITABLE_DIRECTORIES):
+        return "the service can't write there (ProtectSystem=)"
+    if flag not in _HIDDEN_PATH_ADVICE and path.startswith("/") and os.path.exists(path):
+        needed = stat.S_IROTH | (stat.S_IXOTH if os.path.isdir(path) else 0)
+        if _find_inaccessible_file([path]) or os.stat(path).st_mode & needed != needed:
+            return "the service's user can't read it (DynamicUser=)"
+    return None
 
 
 def _find_inaccessible_file(files: Sequence[str]) -> tuple[str, str] | None:

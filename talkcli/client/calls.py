@@ -124,6 +124,15 @@ class ClientCalls:
         _, items = await self._connection.request(request)
         return list(goals(items, "goal"))
 
+    async def dry_run(self, text: str, **options: Any) -> Goal:
+        """Check a text without speaking it. Return its goal as it would be accepted or REJECTED."""
+        request = Say(text, dry_run=True, **options)
+        check(request)
+        if rejected := too_long(request):
+            return rejected
+        reply, _ = await self._connection.request(request)
+        return Goal.from_json(reply.get("goal"))
+
     async def voices(self) -> list[JsonObject]:
         """Return the voices of the server's engine."""
         _, items = await self._connection.request(Voices())

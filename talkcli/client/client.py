@@ -162,6 +162,18 @@ class Client:
         given = {name: value for name, value in locals().items() if name != "self"}
         return run_blocking(self._calls._say(GoalHandle, **given))
 
+    def dry_run(self, text: str, **options: Any) -> Goal:
+        """Check a text without speaking it. Return its goal as it would be accepted or REJECTED.
+
+        The goal has no id. Its `said` is the text as it would be said, or None if it would be said as it is. The
+        options are those of `say` that describe the goal.
+
+        Raises:
+            UsageError: a value is out of its range.
+            ProtocolMismatch: the server is too old for dry runs.
+        """
+        return run_blocking(self._calls.dry_run(text, **options))
+
     @with_parameters_of(say)
     def saying(self, text: str, **options: Any) -> Saying:
         """Return a context manager that speaks a text until its block ends.

@@ -243,7 +243,9 @@ def judge_server(server: JsonObject, log: Sequence[Goal], now: float) -> list[Fi
         now: the current time in seconds since 1970.
     """
     history = _judge_history(server.get("history"))
-    return [_judge_state(server, now), _judge_settings(server), *history, _judge_recent_goals(log, now, server)]
+    pronunciations = _judge_pronunciations(server.get("pronunciations"))
+    recent = _judge_recent_goals(log, now, server)
+    return [_judge_state(server, now), _judge_settings(server), *pronunciations, *history, recent]
 
 
 def _judge_state(server: JsonObject, now: float) -> Finding:
@@ -285,6 +287,21 @@ def _judge_settings(server: JsonObject) -> Finding:
         broken = failure if volume <= 0 else warning
         return broken("settings", words, "talk set --volume 1")
     return ok("settings", words)
+
+
+def _judge_pronunciations(found: object) -> list[Finding]:
+    """Check the file of pronunciations. Return the finding, or nothing if the server was started without a file."""
+    if not isinstance(found, dict):
+        return []
+    path, faults = found.get("file"), found.get("faults")
+    words = f"{found.get('terms')} terms from {path}"
+    if found.get("problem"):
+        words += f"; the file {found['problem']}"
+        return [warning("pronunciation", words, "put the file back, and let the server's user read it")]
+    if isinstance(faults, list) and faults:
+        step = f"correct {path}; the server reads it again before the next sentence"
+        return [warning("pronunciation", "; ".join([words, *map(str, faults)]), step)]
+    return [ok("pronunciation", words)]
 
 
 def _judge_history(history: object) -> list[Finding]:

@@ -15,13 +15,14 @@ import os
 import re
 import stat
 import unicodedata
+from functools import lru_cache
 
 from talkcli.errors import UsageError
 from talkcli.frozen import TYPE_CHECKING
-from talkcli.goals.options import MAX_TEXT_CHARS, is_visible
+from talkcli.goals.options import MARKDOWN, MAX_TEXT_CHARS, is_visible
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from talkcli.goals.goal import JsonObject
 
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     Match = tuple[int, int, str, str]
 
 #: The maximum size of a file of pronunciations, which has room for thousands of terms.
-MAX_FILE_BYTES = 256 * 1024
+MAX_FILE_BYTES = 64 * 1024
 #: The maximum length of a term and of its replacement. Longer phonemes could overrun a buffer of libespeak-ng.
 _MAX_TERM_CHARS, _MAX_REPLACEMENT_CHARS = 100, 200
 #: How many characters the replacements may add to a text. After that, terms are spoken as they are.
@@ -46,6 +47,9 @@ _CHUNK = re.compile(r"[^\W\u2e80-\U0010ffff]+|\S")
 _FIRST_UNSPACED = "\u2e80"
 #: A blank between two words of a term, which is not the end of a paragraph.
 _GAP = r"(?:(?!\n\s*\n)\s)+"
+#: The marks that stand for a pause in Markdown, and the usual marks outside Chinese and Japanese.
+_PAUSES = {"。": ". ", "，": ", "}
+_PAUSE_MARK = re.compile(r"\s*([。，])")
 _NUMBER_MARK = re.compile(r"\d[.,:]\d")
 #: In a text with phonemes, the sender's brackets become parentheses, which sound the same.
 _WITHOUT_BRACKETS = str.maketrans("[]", "()")
@@ -107,6 +111,13 @@ class SpokenText:
         self._last_term = section
         return original, term_chars
 
+    def for_people(self, text_format: str) -> str:
+        """Return the spoken text for people to read. The marks of Markdown leave no blanks and no wide punctuation."""
+        if text_format != MARKDOWN:
+            return self.text
+        narrow = _PAUSE_MARK.sub(lambda found: _PAUSES[found[1]], self.text)
+        return " ".join((self.text if max(narrow, default="") >= _FIRST_UNSPACED else narrow).split())
+
     def _map(self, place: int) -> tuple[int, int]:
         """Find an offset of the spoken text. Return its section, and the matching offset in the sent text.
 
@@ -123,23 +134,25 @@ class Pronunciations:
     def __init__(self, terms: Mapping[str, str]) -> None:
         self.terms = terms
         #: the terms by their first chunk in lower case. The longest term comes first, and its exact case before others.
-        self._by_chunk: dict[str, list[tuple[re.Pattern[str], str]]] = {}
+        self._by_chunk: dict[str, list[tuple[str, str]]] = {}
         for term in sorted(terms, key=lambda each: (-len(each), each == each.lower())):
             for form in dict.fromkeys((term, *(unicodedata.normalize(each, term) for each in ("NFC", "NFD")))):
                 first = _CHUNK.match(form)
                 assert first
-                words = _GAP.join(map(re.escape, form.split()))
-                pattern = re.compile(words, re.IGNORECASE if term == term.lower() else 0)
-                self._by_chunk.setdefault(first.group().lower(), []).append((pattern, term))
+                self._by_chunk.setdefault(first.group().lower(), []).append((form, term))
 
     def apply(self, text: str, start: int = 0, end: int | None = None) -> SpokenText:
         """Return a text, or its part from `start` to `end`, with all terms replaced."""
         end = len(text) if end is None else end
         return SpokenText(text, start, end, list(self._find(text, start, end)))
 
-    def without_phonemes(self) -> Pronunciations:
-        """Return the terms whose replacements have no phonemes, for drivers that don't support them."""
-        return Pronunciations({term: said for term, said in self.terms.items() if "[[" not in said})
+    def apply_to_goal(self, text: str, text_format: str) -> SpokenText:
+        """Replace the terms in a goal's text, without the marks of Markdown."""
+        if text_format == MARKDOWN:
+            from talkcli.engine.markdown import blank_markdown  # rarely needed, and slow to import
+
+            text = blank_markdown(text)
+        return self.apply(text)
 
     def _find(self, text: str, start: int, end: int) -> Iterator[Match]:
         """Yield each term that begins in a part of a text, with its place and its replacement."""
@@ -148,13 +161,19 @@ class Pronunciations:
             begin = chunk.start()
             if begin >= end or added > _MAX_ADDED_CHARS:
                 return
-            for pattern, term in self._by_chunk.get(chunk.group().lower(), ()) if begin >= at else ():
-                found = pattern.match(text, begin)
+            for form, term in self._by_chunk.get(chunk.group().lower(), ()) if begin >= at else ():
+                found = _compile(form).match(text, begin)
                 if found and _is_border(text, begin) and _is_border(text, found.end()):
                     at = found.end()
                     added += len(self.terms[term])
                     yield begin, at, term, self.terms[term]
                     break
+
+
+@lru_cache(1_000)
+def _compile(term: str) -> re.Pattern[str]:
+    """Return a regular expression for a term. Compiling all terms of a file would take too long."""
+    return re.compile(_GAP.join(map(re.escape, term.split())), re.IGNORECASE if term == term.lower() else 0)
 
 
 def _is_border(text: str, at: int) -> bool:
@@ -171,8 +190,11 @@ def _is_word_character(character: str) -> bool:
     return character.isalnum() or character in "_\u200c\u200d" or unicodedata.category(character).startswith("M")
 
 
-def parse_pronunciations(data: bytes) -> tuple[dict[str, str], list[str]]:
-    """Parse a file of pronunciations. Return the terms, and a message about each faulty line."""
+def parse_pronunciations(data: bytes, *, phonemes: bool = True) -> tuple[dict[str, str], list[str]]:
+    """Parse a file of pronunciations. Return the terms, and a message about each faulty line.
+
+    If `phonemes` is false, lines with phonemes are faulty, because the driver doesn't support them.
+    """
     terms: dict[str, str] = {}
     lines: dict[str, int] = {}
     faults = []
@@ -181,6 +203,8 @@ def parse_pronunciations(data: bytes) -> tuple[dict[str, str], list[str]]:
             continue
         term, equals, replacement = (" ".join(each.split()) for each in line.partition("="))
         fault = _find_fault(term, replacement) if equals else "'=' is missing; write: WORD = how it is said"
+        if not fault and "[[" in replacement and not phonemes:
+            fault = "this driver can't speak phonemes"
         if not fault and term in terms:
             fault = f"'{term}' is already in line {lines[term]}"
         if fault:
@@ -211,44 +235,59 @@ class PronunciationFile:
     If the file can't be read later, the last table stays in use.
     """
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, report: Callable[[str], None] = lambda _: None, *, phonemes: bool = True) -> None:
         """Read the file.
+
+        Args:
+            path: the path of the file.
+            report: called with each message for the log.
+            phonemes: whether the driver supports phonemes.
 
         Raises:
             UsageError: the file can't be read.
         """
         self.path = os.path.abspath(path)
+        self._report, self._phonemes = report, phonemes
         self.table = Pronunciations({})
         #: messages about the faulty lines
         self.faults: list[str] = []
         #: why the file can't be read any more, or None
         self.problem: str | None = None
         self._stamp: tuple[int, ...] = ()
-        self.refresh()
-        if self.problem is not None:
-            raise UsageError(f"--pronounce: {self.path} {self.problem}")
-
-    def refresh(self) -> list[str]:
-        """Read the file again if it has changed. Return messages for the log, if any.
-
-        This never waits for a pipe or a device.
-        """
-        before = self.problem
         try:
-            if (stamp := _stamp(_require_file(os.stat(self.path)))) == self._stamp:
-                self.problem = None
-                return []
+            self._read()
+        except (OSError, ValueError) as error:
+            raise UsageError(f"--pronounce: {self.path} {_explain(error)}") from error
+
+    def refresh(self) -> Pronunciations:
+        """Read the file again if it has changed. Return the table.
+
+        If the file can't be read, report this once, and return the last table.
+        """
+        before, self.problem = self.problem, None
+        try:
+            self._read()
+        except (OSError, ValueError) as error:
+            self.problem = _explain(error)
+            if self.problem != before:
+                self._report(f"{self.path} {self.problem}; the terms that were read last stay in use")
+        return self.table
+
+    def _read(self) -> None:
+        """Read the file if it has changed. This never waits for a pipe or a device.
+
+        Raises:
+            OSError, ValueError: the file can't be read.
+        """
+        if (stamp := _stamp(_require_file(os.stat(self.path)))) != self._stamp:
             descriptor = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
             with open(descriptor, "rb") as file:
                 stamp = _stamp(_require_file(os.fstat(descriptor)))
-                terms, faults = parse_pronunciations(file.read(MAX_FILE_BYTES))
-        except (OSError, ValueError) as error:
-            self.problem = f"can't be read: {error.strerror if isinstance(error, OSError) else error}"
-            words = f"{self.path} {self.problem}; the terms that were read last stay in use"
-            return [words] if self.problem != before else []
-        self.table, self.faults, self.problem, self._stamp = Pronunciations(terms), faults, None, stamp
-        count = len(terms)
-        return [f"read {count} pronunciation{'s' * (count != 1)} from {self.path}", *self.describe_faults()]
+                terms, self.faults = parse_pronunciations(file.read(MAX_FILE_BYTES), phonemes=self._phonemes)
+            self.table, self._stamp = Pronunciations(terms), stamp
+            self._report(f"read {len(terms)} pronunciation{'s' * (len(terms) != 1)} from {self.path}")
+            for each in self.describe_faults():
+                self._report(each)
 
     def describe_faults(self) -> list[str]:
         """Return a message about each faulty line, up to a limit."""
@@ -256,14 +295,20 @@ class PronunciationFile:
         shown = [f"{self.path}, {each} (the line is left out)" for each in self.faults[:_MAX_SHOWN_FAULTS]]
         return [*shown, f"{self.path}: {more} more faulty lines"] if more > 0 else shown
 
-    def to_json(self) -> JsonObject:
-        """Return the file's path, number of terms and faults for the reply to `status`."""
+    def describe(self) -> JsonObject:
+        """Read the file again if it has changed. Return its path, number of terms and faults for `status`."""
+        self.refresh()
         return {
             "file": self.path,
             "terms": len(self.table.terms),
             "faults": self.faults[:_MAX_SHOWN_FAULTS],
             "problem": self.problem,
         }
+
+
+def _explain(error: OSError | ValueError) -> str:
+    """Return why a file can't be read."""
+    return f"can't be read: {error.strerror if isinstance(error, OSError) else error}"
 
 
 def _require_file(found: os.stat_result) -> os.stat_result:

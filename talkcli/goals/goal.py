@@ -110,6 +110,8 @@ class Goal:
     #: human-readable description of how the goal ended
     message: str | None = None
     format: str = "text"
+    #: text as it is said, if that differs from `text`; only set in replies about a single goal
+    said: str | None = None
     #: text up to the end of the last word that has started
     spoken: str | None = None
     #: end of the last word that was heard completely, as an offset in the text
@@ -152,6 +154,7 @@ class Goal:
             "message": self.message,
             "text": self.text,
             "format": self.format,
+            "said": self.said,
             "spoken": self.spoken,
             "spoken_end": self.spoken_end,
             "heard": self.heard,

@@ -585,6 +585,14 @@ OPTIONS = (
         for_engine=True,
         in_goal=True,
     ),
+    Option(
+        "dry_run",
+        FLAG,
+        "only check the goal. It is never spoken, and its id is empty. `said` shows how it would be said",
+        default=False,
+        help="Print TEXT as it would be said, and don't speak it.",
+        speech_only=True,
+    ),
 )
 
 #: Names of the options that are sent to the engine.
@@ -627,6 +635,7 @@ class Say:
     more: bool = False
     stall: float = STALL_S
     format: str = "text"
+    dry_run: bool = False
 
     @property
     def is_sound(self) -> bool:

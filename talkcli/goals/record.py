@@ -15,7 +15,9 @@ from talkcli.goals.options import SHOWN_OPTIONS, Say, require_fields
 from talkcli.goals.states import TRANSITIONS, IllegalTransition, State
 
 if TYPE_CHECKING:
-    from talkcli.goals.reasons import Reason
+    from collections.abc import Mapping
+
+    from talkcli.goals.reasons import Reason, Refusal
 
 #: Fields of a goal that are set after the goal was accepted.
 _FIELDS_SET_LATER = ("reason", "by", "message", "started_at", "ended_at", "duration", "voice", "output")
@@ -49,6 +51,8 @@ class Record:
     reason: Reason | None = None
     by: By | None = None
     message: str | None = None
+    #: terms of the text with their replacements, or None before the goal has started
+    pronunciations: Mapping[str, str] | None = None
     #: offset of the end of the last word that has started, or 0 if nothing was heard
     begun_end: int = 0
     #: offset of the end of the last word that was heard completely
@@ -97,6 +101,11 @@ class Record:
         if state not in TRANSITIONS[self.state]:
             raise IllegalTransition(f"a goal can't change from {self.state.name} to {state.name}")
         self.state = state
+
+    def reject(self, refusal: Refusal, now: float) -> None:
+        """Set the state to REJECTED, with the reason and the message."""
+        self.reason, words = refusal
+        self.state, self.message, self.ended_at = State.REJECTED, f"not spoken: {words}", now
 
     def drop_text(self) -> None:
         """Replace the text with a hash to save memory."""

@@ -28,7 +28,7 @@ from talkcli.goals.states import IllegalTransition, State
 from talkcli.goals.voices import VoiceDropOrder, VoiceLoadOrder, VoiceScheduler, VoiceWarning
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Mapping
 
     from talkcli.goals.options import Append, Cancel, Say, Set
 
@@ -257,8 +257,7 @@ class Scheduler:
         if recalled is None and not (by or refused or expired):
             refused = Reason.QUEUE_FULL, f"the queue is full ({len(self.pending)} goals); wait, or cancel some of them"
         if refused:
-            record.reason, words = refused
-            record.state, record.message, record.ended_at = State.REJECTED, f"not spoken: {words}", now.wall
+            record.reject(refused, now.wall)
             self.recent.add(record)
             return record, [StateChange(record, State.REJECTED)]
         record.id, record.more = say.id or record.id, say.more
@@ -273,6 +272,16 @@ class Scheduler:
         effects += self._enqueue(record, recalled or [], now)
         self._request_voice(self.wanted_voice(record), now)
         return record, effects + self._start_next(now) + self._order_next_voice(now)
+
+    def try_out(self, say: Say, sender: Sender, now: Now, server_refusal: Refusal | None) -> Record:
+        """Check a goal without adding it to the queue. Return its record, which is PENDING or REJECTED and has no id.
+
+        The arguments are those of `submit`.
+        """
+        record, first = Record("", 0, say, sender, now.wall), self.find(say.id or "")
+        if refused := self._find_refusal(say, server_refusal, None if first and first.was_sent_as(say) else first):
+            record.reject(refused, now.wall)
+        return record
 
     def cancel(
         self, selection: Cancel, sender: Sender | None, now: Now, waiting_ids: Collection[str | None] = ()
@@ -532,6 +541,10 @@ class Scheduler:
         """Record which voice speaks the active goal. Return the order to load the next voice, if any."""
         self._require_active(goal_id).voice = voice
         return self._order_next_voice(now)
+
+    def pronunciations_chosen(self, goal_id: str, pronunciations: Mapping[str, str]) -> None:
+        """Record how terms in the active goal's text are replaced."""
+        self._require_active(goal_id).pronunciations = pronunciations
 
     def output_changed(self, goal_id: str, output: Output | None) -> None:
         """Record the audio output of the active goal.

@@ -100,7 +100,9 @@ def row_to_json(row: Row) -> JsonObject:
 def without_text(goal: Goal) -> Goal:
     """Return a copy of a goal without its text, and without all fields that may quote the text."""
     by = goal.by and By(goal.by.goal, _without_command_line(goal.by.client))
-    return replace(goal, text=None, spoken=None, message=None, client=_without_command_line(goal.client), by=by)
+    return replace(
+        goal, text=None, said=None, spoken=None, message=None, client=_without_command_line(goal.client), by=by
+    )
 
 
 def _without_command_line(sender: Sender | None) -> Sender | None:

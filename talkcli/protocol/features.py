@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 #: None stands for any value. Never remove a feature.
 FEATURES: dict[str, tuple[str, str, object]] = {
     "append": ("growing texts", "more", True),
+    "dry_run": ("dry runs", "dry_run", True),
     "history": ("filters of the log", "history", True),
     "markdown": ("Markdown", "format", "markdown"),
     "sound": ("sounds", "format", "sound"),

@@ -228,6 +228,11 @@ class Requests:
         The reply shows the goal as it was accepted.
         """
         speech, scheduler, connection = self._speech, self._scheduler, pending.connection
+        if say.dry_run:
+            say, refusal = self._check_goal(pending, say)
+            record = scheduler.try_out(say, connection.client, speech.advance_time(), refusal)
+            pending.answer(goal=speech.describe_goal(record).to_json())
+            return
         waited = 0.0
         if pending.canceled_by is None:
             now = speech.advance_time()
@@ -396,9 +401,12 @@ class Requests:
         if request.id is None:
             self._answer_overview(pending)
         else:
-            history, known = self._speech.history, self._scheduler.find(request.id)
+            speech = self._speech
+            history, known = speech.history, self._scheduler.find(request.id)
             rows = await history.search(pending, {"id": request.id}, 1) if history and not known else []
-            pending.answer(goal=row_to_json(rows[0]) if rows else self._require_goal(request.id).snapshot().to_json())
+            pending.answer(
+                goal=row_to_json(rows[0]) if rows else speech.describe_goal(self._require_goal(request.id)).to_json()
+            )
 
     async def _watch(self, pending: PendingRequest, _: Watch) -> None:
         """Reply with the state of the server, and subscribe the client to all events."""

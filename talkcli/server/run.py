@@ -17,8 +17,10 @@ from talkcli.daemon.systemd import ServiceManager
 from talkcli.engine import protocol
 from talkcli.engine.parent.supervisor import Supervisor
 from talkcli.engine.players import is_silent
+from talkcli.engine.pronunciation import PronunciationFile
 from talkcli.engine.protocol import START_LIMIT_S
 from talkcli.engine.sounds import SoundLibrary
+from talkcli.engine.voices import is_own_driver
 from talkcli.errors import EXIT_OK, EXIT_SIGNAL, AddressInUse, TalkError, UsageError, memory_hint
 from talkcli.frozen import frozen
 from talkcli.goals.goal import JsonObject, Sender
@@ -66,6 +68,8 @@ class ServerSettings:
     voice_memory: int = 300
     #: TEXT_HISTORY, NO_TEXT_HISTORY, or the path of a file with a "/"; None for no history
     history: str | None = None
+    #: path of a file of pronunciations
+    pronounce: str | None = None
     socket: str | None = None
     socket_mode: int = 0o600
     greeting: str | None = None
@@ -120,6 +124,9 @@ class Server:
         self._systemd = ServiceManager(self._loop, self.speech.status_message)
         self.speech.on_status_change = self._systemd.schedule_status
         self._open_history()
+        if settings.pronounce:
+            phonemes = is_own_driver(settings.driver)
+            self.speech.pronunciation_file = PronunciationFile(settings.pronounce, _log_line, phonemes=phonemes)
         self._requests = Requests(self.speech, self._describe)
         self.handle, self.is_waiting = self._requests.handle, self._requests.is_waiting
         self.input_ended = self._requests.input_ended
@@ -314,6 +321,7 @@ class Server:
             "clients": len(self.connections),
             "max_clients": settings.max_clients,
             "history": speech.history.describe() if speech.history else None,
+            "pronunciations": speech.pronunciation_file.describe() if speech.pronunciation_file else None,
         }
 
     # -- shutdown
@@ -353,6 +361,11 @@ class Server:
         with contextlib.suppress(OSError):
             self._listener.close()
         os._exit(EXIT_SIGNAL + number)
+
+
+def _log_line(line: str) -> None:
+    """Write a line with text from a file to the log."""
+    log.write(log.sanitize(line))
 
 
 def _random_boot_id() -> str:

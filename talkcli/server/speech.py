@@ -19,13 +19,22 @@ from talkcli.daemon import log
 from talkcli.engine import protocol
 from talkcli.engine.parent.supervisor import EngineDied, EngineMissing, EngineSaid, Report, ThreadDied
 from talkcli.engine.players import NO_PLAYER_MESSAGE
+from talkcli.engine.pronunciation import Pronunciations
 from talkcli.engine.sounds import SoundLibrary
 from talkcli.engine.voices import is_own_driver
 from talkcli.errors import TalkError, UsageError
 from talkcli.frozen import replace
 from talkcli.goals import options as goal_options
-from talkcli.goals.goal import By, Output, Sender
-from talkcli.goals.options import DEFAULTS, ENGINE_OPTIONS, engine_options, is_neural, require_fields, without_speaker
+from talkcli.goals.goal import By, Goal, Output, Sender
+from talkcli.goals.options import (
+    DEFAULTS,
+    ENGINE_OPTIONS,
+    SOUND,
+    engine_options,
+    is_neural,
+    require_fields,
+    without_speaker,
+)
 from talkcli.goals.reasons import Reason
 from talkcli.goals.scheduler import Effect, EngineOrder, Now, Order, PauseChange, StateChange
 from talkcli.goals.states import State
@@ -37,9 +46,10 @@ from talkcli.server.voices import VoiceCatalog
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from talkcli.engine.parent.supervisor import Supervisor
+    from talkcli.engine.pronunciation import PronunciationFile
     from talkcli.goals.goal import JsonObject
     from talkcli.goals.record import Record
     from talkcli.goals.scheduler import Scheduler
@@ -93,6 +103,8 @@ class Speech:
         self.engine: Supervisor
         #: stores the goals that have ended, or None
         self.history: History | None = None
+        #: how to say terms, or None without a file of pronunciations
+        self.pronunciation_file: PronunciationFile | None = None
         #: called when `status_message` may have changed
         self.on_status_change: Callable[[], None] = lambda: None
         #: called when a goal was added to the queue or removed from it
@@ -243,15 +255,35 @@ class Speech:
                 self.report(protocol.Ended(record.id, protocol.OUTCOME_FAILED, Reason.VOICE_FAILED, why))
                 return
             options["pitch"] = DEFAULTS.pitch  # neural voices don't support other pitches
+        if record.pronunciations is None:
+            self.scheduler.pronunciations_chosen(record.id, self._choose_pronunciations(record))
         command = protocol.Speak(
             record.id,
             record.say.text,
             next_waits=next_waits,
             next_is_neural=next_is_neural,
             more=record.more,
+            pronunciations=dict(record.pronunciations or {}) or None,
             **options,
         )
         self.engine.speak(command)
+
+    def _choose_pronunciations(self, record: Record) -> Mapping[str, str]:
+        """Return the terms to replace in a goal's text. For a text that may grow, these are all terms."""
+        if self.pronunciation_file is None or record.say.format == SOUND:
+            return {}
+        table = self.pronunciation_file.refresh()
+        return table.terms if record.more else table.apply_to_goal(record.say.text, record.say.format).replaced
+
+    def describe_goal(self, record: Record) -> Goal:
+        """Return a copy of a goal that also has the text as it is said, or would be said if it started now."""
+        goal, terms = record.snapshot(), record.pronunciations
+        if terms is None and goal.state is State.PENDING:
+            terms = self._choose_pronunciations(record)
+        if terms is None or goal.text is None:
+            return goal
+        said = Pronunciations(terms).apply_to_goal(goal.text, goal.format).for_people(goal.format)
+        return goal if said == goal.text else replace(goal, said=said)
 
     def _announce_next(self) -> None:
         """Tell the engine whether another goal follows the active one."""
@@ -270,7 +302,7 @@ class Speech:
         self.subscribers.state_changed(record, state, at)
         if state.terminal:
             if self.history:
-                self.history.add(record.snapshot(state))
+                self.history.add(self.describe_goal(record))
             _log_goal_end(record, monotonic_now() - record.began_at)
             resume_all(self.waiting_for_silence.pop(record, {}))
             resume_all(self.waiting_for_hearing.pop(record, {}))

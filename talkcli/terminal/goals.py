@@ -96,6 +96,7 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
         ("message", goal.message and printable(goal.message)),
         ("ended", _describe_cause(goal.by) if goal.by else None),
         ("sound" if goal.format == SOUND else "text", _quote(_shown_text(goal))),
+        ("said", _quote(goal.said)),
         ("spoken", _quote(goal.spoken)),
         ("heard", goal.heard and goal.heard != goal.duration and f"{goal.heard:.2f} s of audio"),
         ("from", _describe_sender(goal.client)),

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 #: asynchronous context manager. The same method never waits.
 TABLE = {
     "Client": {
-        "awaited": "say play follow cancel status goal log voices sounds settings set pause resume close",
+        "awaited": "say dry_run play follow cancel status goal log voices sounds settings set pause resume close",
         "iterated": "events",
         "entered": "stream saying paused",
         "same": "path server_pid",
@@ -48,6 +48,7 @@ ERRORS: list[tuple[str, dict[str, Any], type[Exception], str]] = [
     ("say", {"text": "a", "loud": True}, TypeError, "loud"),
     ("say", {}, TypeError, "text"),
     ("play", {"text": "chirp", "rate": 200}, UsageError, "a sound can't have the option rate"),
+    ("dry_run", {"text": "a", "rate": 9}, UsageError, "the rate must be"),
     ("stream", {"stall": 0}, UsageError, "the stall must be"),
     ("stream", {"throttle": 5}, UsageError, "by its key"),
     ("follow", {"ids": [""]}, UsageError, "empty"),

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from talkcli.cli.services import _find_hidden_path
 from talkcli.daemon.systemd import NOTIFY_RETRY_DELAY_S, STATUS_DELAY_S
 from talkcli.install import NEURAL_PACKAGES
 from tests.conformance.bareserve import SERVE, TALK, BareServe, environment, run, serving
@@ -195,6 +196,31 @@ def test_printing_the_system_unit_warns_if_its_user_cannot_run_talk(home: str) -
         assert warning in done.err
         assert done.out.count("[Service]") == 1  # only the unit is printed
     assert run([script, "serve", "--print-unit", "user"], environment(home)).err == ""
+
+
+@pytest.mark.parametrize(
+    ("options", "warning"),
+    [
+        ("--pronounce /tmp/n.txt", "--pronounce names /tmp/n.txt, but the service has a /tmp of its own (PrivateTmp=)"),
+        ("--pronounce /etc/shadow", "the service's user can't read it (DynamicUser=); copy it into /etc/talk"),
+        ("--sounds /root", "the service's user can't read it (DynamicUser=)"),
+        ("--history /srv/h.db", "the service can't write there (ProtectSystem=); leave out the path"),
+        ("--player file:/srv/x.wav", "--player file: names /srv/x.wav, but the service can't write there"),
+        ("--player /var/tmp/play", "--player names /var/tmp/play, but the service has a /tmp of its own"),
+        ("--socket /var/tmp/s", "choose a path in /run/talk"),
+        ("--pronounce /etc/passwd --sounds /etc --history no-text --player file:/run/talk/x.wav", None),
+    ],
+)
+def test_printing_the_system_unit_warns_about_paths_that_the_unit_hides(
+    home: str, options: str, warning: str | None
+) -> None:
+    for name in ("system", "user"):
+        notes = run([*TALK, "serve", *options.split(), "--print-unit", name], environment(home)).err.splitlines()
+        hidden = [line for line in notes if " names " in line]
+        assert len(hidden) == (1 if warning and name == "system" else 0)
+        assert not hidden or str(warning) in hidden[0]
+    hidden_home = _find_hidden_path("--pronounce", "/home/a/n.txt", hides_home=True)
+    assert hidden_home == "the unit hides home directories (ProtectHome=)"
 
 
 def test_systemd_rates_the_system_service_as_well_protected(home: str) -> None:

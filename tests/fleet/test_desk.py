@@ -80,6 +80,8 @@ def comparable(done: Finished) -> tuple[int, str, str]:
         ("cancel nothing", 8),
         ("say --rate 9999 hello", 2),
         ("--json say -wf --id old hello", 0),
+        ("say --dry-run --id new --markdown # *hello*", 0),
+        ("say --dry-run --voice parrot hello", 5),
         ("-q say --throttle 60 --key door hello", 0),
     ],
 )
@@ -174,6 +176,7 @@ def test_ctrl_c_cancels_lines_of_a_command_that_has_run_for_a_while(robot: Robot
         ("--robot anna bridge --name anna", "bridge"),
         ("--robot anna completion bash", "completion"),
         ("--robot anna say -o - hello", "--output"),
+        ("--robot @all say --dry-run hello", "'talk say --dry-run' only works with one robot"),
         ("--robot an/na status", "an/na"),
         ("--robot # status", "#"),
         ("--robot= status", "empty"),

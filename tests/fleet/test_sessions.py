@@ -121,6 +121,18 @@ async def test_an_idle_remote_client_loses_its_session_silently(talk: Talk, pass
 
 
 @in_loop
+async def test_dry_runs_do_not_count_as_waiting_goals(talk: Talk) -> None:
+    anna = SessionsWithoutBroker(talk.socket)
+    for number in range(30):
+        reply = await anna.ask(say(number, dry_run=True, id=f"dry-{number}"), "s1")
+        assert (reply["goal"]["state"], reply["goal"]["id"]) == ("PENDING", "")
+    assert (await anna.ask(say(30), "s1"))["goal"]["state"] == "PENDING"
+    assert talk.request("status")["server"]["pending"] == 1
+    anna.post(b"", "s1")
+    await await_no_sessions(talk)
+
+
+@in_loop
 async def test_only_goals_that_wait_for_room_are_dropped_by_a_goodbye(talk: Talk) -> None:
     """With and without a connection to the server. A client that returns after a goodbye gets answers again."""
     anna = SessionsWithoutBroker(talk.socket)

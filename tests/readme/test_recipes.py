@@ -237,3 +237,14 @@ def test_the_examples_for_sounds_play_them(make_talk: MakeTalk, shell: Shell) ->
     assert done.stdout.split()[3:] == ["chirp", "error", "horn", "warning"]
     assert shell.run("talk play -w horn", TALK_SOCKET=talk.socket).returncode == 0
     assert texts_of(talk)[-1] == "horn"
+
+
+@runs("Pronunciation", "Pronunciation #2", "Pronunciation #3")
+def test_the_examples_for_pronunciation_show_what_is_said(make_talk: MakeTalk, shell: Shell) -> None:
+    (shell.directory / "names.txt").write_text(block("Pronunciation"))
+    serve = block("Pronunciation #2").strip().replace("names.txt", f"{shell.directory}/names.txt").split()[2:]
+    talk = make_talk(*serve, "--player", "null")
+    done = shell.run(block("Pronunciation #3"), TALK_SOCKET=talk.socket)
+    assert (done.returncode, done.stderr) == (0, ""), done
+    assert f"# {done.stdout}" in block("Pronunciation #3")
+    assert (shell.directory / "hello.wav").stat().st_size > 10_000

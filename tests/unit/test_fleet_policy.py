@@ -387,3 +387,10 @@ def test_the_sender_name_of_a_remote_user_has_a_prefix_and_fits() -> None:
 def test_the_user_of_a_remote_goal_is_part_of_its_senders_name(name: str | None, user: str | None) -> None:
     assert policy.remote_user(Goal("a", State.PENDING, client=Sender(name=name))) == user
     assert policy.remote_user(Goal("a", State.PENDING)) is None
+
+
+def test_a_message_without_texts_has_no_field_that_may_quote_one() -> None:
+    goal = Goal("a", State.SUCCEEDED, "secret", said="secret", spoken="secret", message="'secret'").to_json()
+    kept = policy.without_texts({"goal": goal, "n": 1}, policy.PRIVATE_FIELDS)
+    assert "secret" not in str(kept)
+    assert kept["n"] == 1

@@ -116,7 +116,7 @@ def test_an_option_outside_its_limits_is_refused_by_name(name: str, value: objec
 
 
 def test_a_sound_has_no_options_of_speech() -> None:
-    values = {"rate": 200, "voice": "en", "voice_only": True, "pitch": 50, "more": True, "stall": 9}
+    values = {"rate": 200, "voice": "en", "voice_only": True, "pitch": 50, "more": True, "stall": 9, "dry_run": True}
     for name, value in values.items():
         message = f"a sound can't have the option {name}; leave it out"
         assert bad_option(Say("chirp", format="sound", **{name: value})) == message  # type: ignore[arg-type]
@@ -192,7 +192,7 @@ def test_the_librarys_parameters_agree_with_the_rows() -> None:
     assert parameters.pop("block") == ("bool", True)
     assert parameters.pop("text") == ("str", inspect.Parameter.empty)
     own = annotated(Say)
-    rows = [option for option in OPTIONS if option.name not in {"text", "wait", "more", "stall"}]
+    rows = [option for option in OPTIONS if option.name not in {"text", "wait", "more", "stall", "dry_run"}]
     assert parameters == {option.name: (own[option.name], option.default) for option in rows}
     typed = [option.name for option in rows if option.flags and option.name != "feedback"]
     assert [name for name in parameters if name in typed] == typed

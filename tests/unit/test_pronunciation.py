@@ -14,6 +14,7 @@ from talkcli.engine.pronunciation import MAX_FILE_BYTES, PronunciationFile, Pron
 from talkcli.errors import UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
 TERMS = {
@@ -120,27 +121,34 @@ def test_faulty_lines_are_named_and_left_out() -> None:
 
 
 def test_a_changed_file_is_read_again_and_a_lost_one_is_reported_once(tmp_path: Path) -> None:
-    path = tmp_path / "names.txt"
+    path, log = tmp_path / "names.txt", list[str]()
+
+    def refresh() -> tuple[Mapping[str, str], list[str]]:
+        log.clear()
+        return file.refresh().terms, log
+
     path.write_text("a = b\nfaulty\n" * 12)
-    file = PronunciationFile(str(path))
-    assert file.table.terms == {"a": "b"}
-    assert file.refresh() == []
-    assert len(file.describe_faults()) == 11
+    file = PronunciationFile(str(path), log.append)
+    assert len(log) == 12
+    assert log[::11] == [f"read 1 pronunciation from {path}", f"{path}: 13 more faulty lines"]
+    assert refresh() == ({"a": "b"}, [])
     path.write_text("a = c\n")
-    assert file.refresh() == [f"read 1 pronunciation from {path}"]
+    assert refresh() == ({"a": "c"}, [f"read 1 pronunciation from {path}"])
     path.unlink()
-    assert file.refresh() == [
-        f"{path} can't be read: No such file or directory; the terms that were read last stay in use"
-    ]
-    assert file.refresh() == []
+    problem = "can't be read: No such file or directory"
+    assert refresh() == ({"a": "c"}, [f"{path} {problem}; the terms that were read last stay in use"])
+    assert refresh() == ({"a": "c"}, [])
+    assert file.describe()["problem"] == problem
     os.mkfifo(path)
-    assert "it is not a regular file" in file.refresh()[0]
-    assert (file.refresh(), file.table.terms) == ([], {"a": "c"})
+    assert "it is not a regular file" in refresh()[1][0]
+    assert refresh() == ({"a": "c"}, [])
     path.unlink()
-    path.write_text("a = d\nfaulty")
-    fault = "line 2: '=' is missing; write: WORD = how it is said"
-    assert file.refresh() == [f"read 1 pronunciation from {path}", f"{path}, {fault} (the line is left out)"]
-    assert file.to_json() == {"file": str(path), "terms": 1, "faults": [fault], "problem": None}
+    path.write_text("a = d\nfaulty\nb = [[b]]\n")
+    file._phonemes = False
+    faults = ["line 2: '=' is missing; write: WORD = how it is said", "line 3: this driver can't speak phonemes"]
+    shown = [f"{path}, {each} (the line is left out)" for each in faults]
+    assert refresh() == ({"a": "d"}, [f"read 1 pronunciation from {path}", *shown])
+    assert file.describe() == {"file": str(path), "terms": 1, "faults": faults, "problem": None}
 
 
 @pytest.mark.parametrize("kind", ["missing", "directory", "pipe", "device", "large"])

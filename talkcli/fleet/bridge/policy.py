@@ -45,7 +45,7 @@ MAX_REMEMBERED_IDS = 1_000
 #: Maximum size of the correlation data, which is repeated in the header of each answer.
 MAX_CORRELATION_BYTES = 256
 #: Fields of a goal that may contain its text. The field `message` may quote the text.
-PRIVATE_FIELDS = ("text", "spoken", "message")
+PRIVATE_FIELDS = ("text", "said", "spoken", "message")
 #: TTL of a goal whose message expired while the goal was waiting for room. Zero would mean no limit.
 _EXPIRED_TTL_S = 0.001
 
@@ -314,7 +314,7 @@ class RemoteGoals:
         self._goals |= {goal_id: (key, True) for goal_id, key in pending}
 
 
-def without_texts(message: JsonObject, hidden: tuple[str, ...] = ("text", "spoken")) -> JsonObject:
+def without_texts(message: JsonObject, hidden: tuple[str, ...] = ("text", "said", "spoken")) -> JsonObject:
     """Return a copy of a message in which the `hidden` fields of each goal are null."""
     return {
         name: {**each, **dict.fromkeys(hidden)} if isinstance(each, dict) and "text" in each else each

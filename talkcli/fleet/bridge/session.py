@@ -351,7 +351,7 @@ class RemoteSession:
     def _send_request(self, remote_request: RemoteRequest) -> None:
         """Send a client's request to the server. Change, delay or refuse it if necessary."""
         request = remote_request.request
-        if isinstance(request, Say):
+        if isinstance(request, Say) and not request.dry_run:
             self.send_say(remote_request, request)
         elif isinstance(request, Cancel):
             self._send_cancel(remote_request, request)
@@ -487,7 +487,7 @@ class RemoteSession:
         if isinstance(goal, dict):
             state = State.__members__.get(str(goal.get("state")))
             waits = isinstance(request, Wait) or (isinstance(request, Say) and (request.wait or request.feedback))
-            if waits and state is not None and not state.terminal:
+            if waits and goal.get("id") and state is not None and not state.terminal:
                 self._awaited.add(str(goal.get("id")))
         shows_others = isinstance(request, Watch | Log) or (isinstance(request, Status) and request.id is not None)
         if shows_others and not self._sessions.with_text:
