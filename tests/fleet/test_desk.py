@@ -30,6 +30,7 @@ from tests.support.surroundings import short_directory
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from tests.conftest import MakeTalk
     from tests.support.processes import Clients, Finished, Process
@@ -64,6 +65,8 @@ def comparable(done: Finished) -> tuple[int, str, str]:
         ("status nothing", 8),
         ("--json status nothing", 8),
         ("--json log -n 5", 0),
+        ("--json log --since 2h --key door --state succeeded --grep ell", 0),
+        ("log --since never", 2),
         ("--json voices --language en", 0),
         ("voices --language xx", 1),
         ("set", 0),
@@ -303,6 +306,22 @@ def test_a_goal_may_be_sent_from_several_threads(client: Client) -> None:
     handles = [future.result() for future in futures]
     assert {handle.id for handle in handles} == {"the-same"}
     assert sum(not handle.attached for handle in handles) == 1
+
+
+def test_a_robots_history_is_sent_in_several_messages(broker: Broker, make_talk: MakeTalk, tmp_path: Path) -> None:
+    talk = make_talk("--history", f"{tmp_path}/h.db", scripted=True)
+    text = "\0" + "long " * 1_900  # a text with NUL is rejected at once
+    with talk.connect() as wire:
+        ids = [wire.request("say", text=text)["goal"]["id"] for _ in range(100)]
+    talk.stop()
+    talk.start_server()
+    with Bridge(talk, broker, "anna") as bridge:
+        bridge.await_online()
+        done = desk(broker, "anna", "--json", "log", "--since", "2h")
+        assert [(goal["id"], goal["text"]) for goal in map(json.loads, done.out.splitlines())] == [
+            (goal_id, text) for goal_id in ids
+        ]
+        assert bridge.terminate() == 0
 
 
 @pytest.mark.slow  # a broker doesn't report withheld messages, so the desk waits for its limit of 5 s

@@ -294,6 +294,9 @@ def test_with_no_text_only_the_remote_client_reads_a_sentence(broker: Broker, ma
         listener.await_message(lambda event: event.topic.endswith("/state") and event.json["state"] == "SUCCEEDED")
         listener.await_message(lambda message: message.topic.endswith("/status") and "SUCCEEDED" in message.text)
         carl.line(lambda line: line.get("state") == "SUCCEEDED")
+        assert carl.ask("log", history=True)["count"] == carl.ask("log")["count"] == 3
+        assert carl.ask("status", id=goal["id"])["goal"]["key"] is None
+        assert carl.ask("log", grep="secret")["error"]["code"] == "not_allowed"
         messages = [*listener.messages, *carl.listener.messages]
     assert {message.topic.rpartition("/")[2] for message in messages} >= {"state", "status", "presence"}
     assert [message for message in messages if "secret" in message.text] == []
