@@ -22,7 +22,7 @@ from talkcli.errors import RequestRefused
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Log
 from talkcli.goals.states import State
-from talkcli.history.file import HistoryWriter
+from talkcli.history.file import HistoryWriter, search
 from talkcli.server import history
 from talkcli.server.connection import PendingRequest
 from tests.conformance.bareserve import TALK, environment, run
@@ -233,6 +233,39 @@ def test_a_killed_server_loses_at_most_two_seconds_of_its_history(
             newest = database.execute("SELECT ended_at FROM goals ORDER BY number DESC LIMIT 1").fetchone()[0]
         assert last["ended_at"] - newest < 2, number
         talk.start_server()
+
+
+def test_replies_that_were_read_do_not_count_as_unread(make_talk: MakeTalk, tmp_path: Path) -> None:
+    """Otherwise, the server would disconnect clients after 64 MiB."""
+    talk = make_talk("--history", f"{tmp_path}/h.db", scripted=True, watched=False)
+    with talk.connect() as wire:
+        for _ in range(30):
+            wire.request("say", text="\0" + "x" * 60_000)
+        for _ in range(40):
+            assert wire.request("log", count=30, history=True)["count"] == 30
+
+
+def test_the_newest_goals_are_kept_while_they_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(history, "MAX_UNWRITTEN_GOALS", 3)
+    monkeypatch.setattr(history, "RETRY_AFTER_S", 0.01)
+
+    async def run() -> None:
+        (tmp_path / "no directory").touch()
+        store = history.History(f"{tmp_path}/no directory/h.db", with_text=True)
+        for number in range(5):
+            store.add(Goal(f"4k7f-{number}", State.SUCCEEDED, ended_at=time.time()))
+        assert (store.describe()["unwritten"], store.describe()["dropped"]) == (3, 2)
+        os.unlink(tmp_path / "no directory")
+        store.close()
+
+    asyncio.run(run())
+    assert [row[0] for row in search(f"{tmp_path}/no directory/h.db", "1", [], 9, time.monotonic() + 9)] == [
+        "4k7f-2",
+        "4k7f-3",
+        "4k7f-4",
+    ]
 
 
 def test_a_search_that_the_disk_does_not_answer_fails_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

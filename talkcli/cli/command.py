@@ -9,7 +9,7 @@ This module also parses option values, and texts that may contain invalid UTF-8.
 from __future__ import annotations
 
 from talkcli.frozen import TYPE_CHECKING, frozen
-from talkcli.goals.options import FLAG, ID, MOMENT, PATH, SECONDS, WORD, Kind, Option
+from talkcli.goals.options import FLAG, ID, MOMENT, PATH, SECONDS, SENDER_NAME, WORD, Kind, Option
 from talkcli.paths import named_robot
 
 if TYPE_CHECKING:
@@ -217,14 +217,14 @@ def read_value(option: Option, text: str) -> Any:
         return _parse_number(option, text)
     if kind is FILE_MODE:
         return _parse_file_mode(text)
-    if kind in (WORD, ID):
+    if kind in (WORD, ID, SENDER_NAME):
         text = _as_utf8(text)
         bad = next(filter(_is_bad_byte, text), None)
         if bad:
             raise ValueError(f"the byte {_format_byte(bad)} is not valid UTF-8")
     if option.choices and text not in option.choices:
         raise ValueError(f"must be one of {', '.join(option.choices)}, got '{text}'")
-    if not text and kind in (WORD, ID, PATH):  # an empty value usually comes from an unset variable
+    if not text and kind in (WORD, ID, PATH, SENDER_NAME):  # an empty value usually comes from an unset variable
         raise ValueError("must not be empty; check the variable that should contain the value")
     return text
 
