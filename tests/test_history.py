@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -22,7 +22,9 @@ from talkcli.errors import RequestRefused
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Log
 from talkcli.goals.states import State
-from talkcli.history.file import HistoryWriter, search
+from talkcli.history import file
+from talkcli.history.file import HistoryError, HistoryWriter
+from talkcli.history.rows import to_row
 from talkcli.server import history
 from talkcli.server.connection import PendingRequest
 from tests.conformance.bareserve import TALK, environment, run
@@ -246,49 +248,68 @@ def test_replies_that_were_read_do_not_count_as_unread(make_talk: MakeTalk, tmp_
 
 
 def test_the_newest_goals_are_kept_while_they_cannot_be_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(history, "MAX_UNWRITTEN_GOALS", 3)
     monkeypatch.setattr(history, "RETRY_AFTER_S", 0.01)
+    directory, failures = tmp_path / "state", threading.Semaphore(0)
+    write = HistoryWriter.write
+
+    def count_failures(*arguments: Any) -> str | None:
+        try:
+            return write(*arguments)
+        except HistoryError:
+            failures.release()
+            raise
 
     async def run() -> None:
-        (tmp_path / "no directory").touch()
-        store = history.History(f"{tmp_path}/no directory/h.db", with_text=True)
+        directory.touch()  # a file is in the way
+        store = history.History(f"{directory}/h.db", with_text=True)
         for number in range(5):
             store.add(Goal(f"4k7f-{number}", State.SUCCEEDED, ended_at=time.time()))
+        for _ in range(3):
+            assert await asyncio.to_thread(failures.acquire, timeout=10)
         assert (store.describe()["unwritten"], store.describe()["dropped"]) == (3, 2)
-        os.unlink(tmp_path / "no directory")
+        os.unlink(directory)
         store.close()
 
+    monkeypatch.setattr(HistoryWriter, "write", count_failures)
     asyncio.run(run())
-    assert [row[0] for row in search(f"{tmp_path}/no directory/h.db", "1", [], 9, time.monotonic() + 9)] == [
-        "4k7f-2",
-        "4k7f-3",
-        "4k7f-4",
-    ]
+    assert capfd.readouterr().err.count("can't write to the history") == 1
+    rows = file.search(f"{directory}/h.db", "1", [], 9, time.monotonic() + 9)
+    assert [row[0] for row in rows] == ["4k7f-2", "4k7f-3", "4k7f-4"]
 
 
-def test_a_search_that_the_disk_does_not_answer_fails_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_search_fails_if_the_disk_does_not_respond_and_finds_unwritten_goals_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second search reads the file just after the goal was written."""
+    goal = Goal("4k7f-1", State.SUCCEEDED, "door open", ended_at=time.time())
     responds = threading.Event()
-    monkeypatch.setattr(history, "search", lambda *_: responds.wait(20) and [])
+    monkeypatch.setattr(history, "search", lambda *_: responds.wait(20) and [to_row(goal)])
     monkeypatch.setattr(history, "SEARCH_LIMIT_S", 0.1)
 
-    async def run() -> None:
-        store = history.History(f"{tmp_path}/h.db", with_text=True)
-        failed = asyncio.get_running_loop().create_future()
+    async def search(store: history.History) -> object:
+        answer = asyncio.get_running_loop().create_future()
 
         async def steps() -> None:
             try:
-                await store.search(pending, {}, 1)
+                answer.set_result(await store.search(pending, {}, 5))
             except RequestRefused as error:
-                failed.set_result(error.code)
+                answer.set_result(error.code)
 
         pending = PendingRequest(None, 1, Log())  # type: ignore[arg-type]
         pending.start(steps())
-        assert await asyncio.wait_for(failed, 10) == HISTORY_FAILED
-        store.add(Goal("4k7f-1", State.SUCCEEDED, "door open", ended_at=time.time()))
+        return await asyncio.wait_for(answer, 10)
+
+    async def run() -> None:
+        store = history.History(f"{tmp_path}/h.db", with_text=True)
+        store.add(goal)
+        assert await search(store) == HISTORY_FAILED
         responds.set()
-        store.close()  # writes the goal
+        monkeypatch.setattr(history, "SEARCH_LIMIT_S", 10.0)
+        assert await search(store) == [to_row(goal)]
+        store.close()
 
     asyncio.run(run())
     assert b"door open" in stored_files(str(tmp_path))

@@ -91,6 +91,8 @@ def test_a_damaged_file_is_set_aside(path: str, writer: HistoryWriter, *, is_ope
             stored(path)
     message = writer.write([goal(1)], failed.value.damaged_file if is_open else None)
     assert message == f"{path} was damaged; it was renamed to {path}.damaged, and a new history was started"
+    if is_open:
+        assert writer.write([], failed.value.damaged_file) is None  # another search has found the same damage
     assert stored(path) == ["4k7f-1"]
     with open(f"{path}.damaged", "rb") as kept:
         assert kept.read(8) == b"garbage "
