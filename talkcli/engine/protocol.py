@@ -62,6 +62,7 @@ HOLD_LIMIT_S = 4.0
 # Outcomes of a `Speak`.
 OUTCOME_COMPLETED = "completed"  # the player played every sample
 OUTCOME_STOPPED = "stopped"  # a `Stop` ended the goal
+OUTCOME_INTERRUPTED = "interrupted"  # an `Interrupt` ended the goal at the end of a word; see `Ended.rest`
 OUTCOME_FAILED = "failed"  # an error ended the goal; see `Ended.reason` and `Ended.message`
 
 
@@ -115,6 +116,11 @@ class Speak:
     more: bool = False  # whether text will be added with `Append`
     broken: bool = False  # whether the text broke off; an incomplete sentence at its end is not spoken
     pronunciations: dict[str, str] | None = None  # terms of the text with their replacements
+    # The next fields describe what was heard before the goal was interrupted.
+    start: int = 0  # offset in the text at which the speech begins
+    heard_end: int = 0  # offset of the end of the last word that was reported
+    heard_words: int = 0  # number of words that were reported
+    heard: float = 0.0  # seconds of audio that were heard
 
 
 @frozen
@@ -135,6 +141,16 @@ class Stop:
     """The command to stop speaking a goal at once.
 
     The process ignores it if the goal has already ended.
+    """
+
+    id: str
+
+
+@frozen
+class Interrupt:
+    """The command to end a goal at the end of the current word, so that another `Speak` can continue it.
+
+    The process ignores it if the goal has already ended. If no word follows, the goal ends as usual.
     """
 
     id: str
@@ -333,7 +349,7 @@ class Ended:
     """The goal has ended, and nothing more of it will be heard."""
 
     id: str
-    outcome: str  # OUTCOME_COMPLETED, OUTCOME_STOPPED or OUTCOME_FAILED
+    outcome: str  # one of the constants such as OUTCOME_COMPLETED
     reason: Reason | None = None  # reason for the failure, if the goal failed
     message: str | None = None  # error message of the player or the engine, if the goal failed
     duration: float | None = None  # length of the audio in seconds; None unless the goal was completed
@@ -341,11 +357,14 @@ class Ended:
     gap_seconds: float = 0.0  # total length of the silent gaps, in seconds
     player: str | None = None  # the player that worked last, if it was chosen automatically
     heard: float | None = None  # seconds of the audio that were heard; None if unknown
+    rest: int | None = None  # offset at which the text continues; None unless the goal was interrupted
 
 
 #: Commands that start a goal. There is one for each kind of goal.
 GoalCommand = Speak
-Command = Configure | GoalCommand | Append | Stop | Hold | Continue | NextGoal | LoadVoice | DropVoice
+#: Commands for the current goal, which they name by its `id`.
+ActiveGoalCommand = Append | Stop | Interrupt | Hold | Continue | NextGoal
+Command = Configure | GoalCommand | ActiveGoalCommand | LoadVoice | DropVoice
 #: Events about the goal with the given `id`.
 GoalEvent = Started | Alive | Word | TextMissing | OutputChanged | VoiceChosen | Held | Ended
 VoiceEvent = VoiceList | VoiceLoaded | VoiceUnloaded | VoiceMemory

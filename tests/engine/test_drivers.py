@@ -29,9 +29,10 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.engine.child.cutting import GrowingText
-    from talkcli.engine.child.players.base import Interest
+    from talkcli.engine.child.players.base import EndedEarly, Interest
     from talkcli.engine.child.runner import GoalRunner
     from talkcli.engine.child.synthesizers.base import SampleSink, SpeechSettings, Synthesizer
+    from talkcli.engine.child.words import TimedWord
 
 #: The part that all drivers here share. It has no settable properties, and registers the driver with pyttsx3.
 _DRIVER = """
@@ -374,7 +375,9 @@ class Recorder:
 
     def __init__(self, player: str = "null", synthesizer: Synthesizer | None = None) -> None:
         self.notifications: list[tuple[str, dict[str, Any]]] = []
-        self.position: float | None = None
+        self.word: TimedWord | None = None
+        self.ended_early: EndedEarly | None = None
+        self.word_end_due: float | None = None
         self.duration: float | None = None
         self.heard: float | None = None
         self.growing_text: GrowingText | None = None
@@ -396,7 +399,7 @@ class Recorder:
     def _make_callback(self, topic: str) -> Callable[..., None]:
         def record(**values: object) -> None:
             self.notifications.append((topic, values))
-            self.times.append((self.position, self.duration))
+            self.times.append((self.word.position if self.word else None, self.duration))
             if topic == "started-word":
                 self.at_word()
 
@@ -408,6 +411,9 @@ class Recorder:
             poll.register(descriptor, events)
         poll.poll(None if until is None else max(0.0, until - time.monotonic()) * 1000)
         self.at_wait()
+
+    def find_word(self, location: int, length: int) -> tuple[int, int, int]:
+        return location, location + length, 1
 
     def report_voice(self, _voice: str, _fallback_reason: str | None) -> None:
         pass

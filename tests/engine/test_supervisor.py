@@ -239,6 +239,50 @@ def test_a_goal_fails_if_two_processes_die_before_starting_it(start: StartThread
     assert thread.spoken("yes", "g2").outcome == OUTCOME_COMPLETED
 
 
+def _interrupted(rest: int) -> protocol.Ended:
+    return protocol.Ended("g1", protocol.OUTCOME_INTERRUPTED, rest=rest)
+
+
+def test_an_interrupted_goal_ends_once_and_can_be_continued(start: StartThread) -> None:
+    thread = start()
+    thread.say("never-ends length=9 two")
+    thread.until(protocol.Word)
+    thread.engine.interrupt("g2")  # another goal
+    thread.engine.interrupt("g1")
+    thread.engine.stop("g1")
+    assert thread.until(protocol.Ended) == _interrupted(rest=11)
+    assert thread.spoken("yes", "g1") == SPOKEN
+
+
+def test_a_goal_that_no_process_has_started_is_interrupted_before_its_first_word(start: StartThread) -> None:
+    thread = start("slow")
+    thread.say("yes")
+    thread.engine.interrupt("g1")
+    assert thread.until(protocol.Ended) == _interrupted(rest=0)
+    thread.until(protocol.Ready)
+    _signal(thread, signal.SIGSTOP)
+    thread.say("yes")
+    thread.engine.interrupt("g1")
+    _signal(thread, signal.SIGKILL)
+    assert thread.until(protocol.Ended) == _interrupted(rest=0)
+    assert thread.spoken("yes", "g1") == SPOKEN
+
+
+def test_an_interrupted_goal_that_has_started_fails_with_its_process(start: StartThread) -> None:
+    thread = start()
+    thread.say("never-ends")  # without another word, the process continues it
+    thread.until(protocol.Word)
+    thread.engine.interrupt("g1")
+    _signal(thread, signal.SIGKILL)
+    assert thread.until(protocol.Ended).reason == "engine_crashed"
+
+
+def _signal(thread: EngineThread, number: int) -> None:
+    process = thread.engine._process
+    assert process is not None
+    os.kill(process.pid, number)
+
+
 def test_an_abandoned_process_gets_no_other_goal(start: StartThread) -> None:
     thread = start()
     thread.say("never-ends ignore-stop")

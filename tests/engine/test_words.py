@@ -104,7 +104,7 @@ def test_words_stay_in_order_and_inside_the_text_for_any_positions(text: str, po
 
 def test_the_clock_waits_for_its_start_and_for_the_player() -> None:
     clock = WordClock()
-    first, second = TimedWord(0, 1, 0.0), TimedWord(2, 1, 0.5)
+    first, second = TimedWord(0, 1, 1, 0.0), TimedWord(2, 3, 2, 0.5)
     clock.add(first)
     clock.add(second)
     assert clock.pop_started(100.0) == []
@@ -124,7 +124,7 @@ def test_the_clock_waits_for_its_start_and_for_the_player() -> None:
 
 def test_inserted_silence_delays_later_words_and_does_not_count_as_heard() -> None:
     clock = WordClock()
-    before, at, after = TimedWord(0, 1, 0.4), TimedWord(2, 1, 0.5), TimedWord(4, 1, 1.0)
+    before, at, after = TimedWord(0, 1, 1, 0.4), TimedWord(2, 3, 2, 0.5), TimedWord(4, 5, 3, 1.0)
     clock.reset(0.0)
     clock.add_silence(0.0, 0.25)
     clock.start(100.0)
@@ -147,7 +147,7 @@ def test_inserted_silence_delays_later_words_and_does_not_count_as_heard() -> No
 
 def test_a_new_stream_starts_at_its_position_in_the_sentence() -> None:
     clock = WordClock()
-    missed, word = TimedWord(0, 1, 1.0), TimedWord(2, 1, 2.5)
+    missed, word = TimedWord(0, 1, 1, 1.0), TimedWord(2, 3, 2, 2.5)
     clock.start(100.0)
     clock.add_silence(0.5, 3.0)
     clock.reset(2.0)
@@ -164,7 +164,7 @@ def test_a_new_stream_starts_at_its_position_in_the_sentence() -> None:
 
 def test_the_outputs_clock_starts_with_the_first_sound() -> None:
     clock = WordClock()
-    clock.add(TimedWord(0, 1, 0.5))
+    clock.add(TimedWord(0, 1, 1, 0.5))
     clock.start(100.0)
     clock.set_elapsed(100.2, 0.0)
     assert (clock.elapsed(100.2), clock.next_word_at()) == (0.0, NEVER)
@@ -176,6 +176,6 @@ def test_the_outputs_clock_starts_with_the_first_sound() -> None:
 def test_words_in_skipped_silence_start_with_the_sound() -> None:
     clock = WordClock()
     for position in (0.0, 0.2):
-        clock.add(TimedWord(0, 1, position))
+        clock.add(TimedWord(0, 1, 1, position))
     clock.delay_words_until(0.1)
     assert [word.position for word in clock.pop_all()] == [0.1, 0.2]

@@ -32,7 +32,9 @@ class Goal:
         self.script = script.Script(say.text)
         self.text, self.more, self.broken = say.text, say.more, say.broken
         #: number of words that are planned or heard, and the seconds that they take
-        self.words, self.length = 0, 0.0
+        self.words, self.length = say.heard_words, say.heard
+        #: number of words that were heard
+        self.heard = say.heard_words
         self.text_missing = self.grown = False
         self.plan: list[tuple[float, Callable[[], None]]] = []
         self.stopped = False
@@ -114,7 +116,7 @@ class Engine:
         elif isinstance(command, protocol.Speak):
             self._say(command)
         elif goal is None or not isinstance(
-            command, protocol.Append | protocol.Stop | protocol.Hold | protocol.Continue
+            command, protocol.Append | protocol.Stop | protocol.Interrupt | protocol.Hold | protocol.Continue
         ):
             pass  # only matters with sound
         elif goal.id != command.id or goal.stopped:
@@ -125,6 +127,8 @@ class Engine:
                 self._continue(goal)
         elif isinstance(command, protocol.Stop):
             self._stop(goal)
+        elif isinstance(command, protocol.Interrupt):
+            self._interrupt(goal)
         elif isinstance(command, protocol.Hold):
             self._pause(goal, command.number)
         else:
@@ -177,7 +181,7 @@ class Engine:
         for index, (start, end) in enumerate(spans):
             at = length * index / len(spans)
             word = protocol.Word(goal.id, start, end, goal.words - len(spans) + index + 1, round(begin + at, 3))
-            goal.then(now + at, lambda word=word: self._send(word))  # type: ignore[misc]
+            goal.then(now + at, lambda word=word: self._hear(goal, word))  # type: ignore[misc]
         goal.length = round(begin + length, 6)
         act = words.act
         if act:
@@ -204,6 +208,17 @@ class Engine:
         act = goal.script.text("on-stop")
         action = (lambda: self._act(act)) if act else (lambda: self._end(protocol.OUTCOME_STOPPED))
         goal.then(time.monotonic() + goal.script.number("slow-stop"), action)
+
+    def _hear(self, goal: Goal, word: protocol.Word) -> None:
+        goal.heard = word.number
+        self._send(word)
+
+    def _interrupt(self, goal: Goal) -> None:
+        """End the goal at once before its next word, if there is one."""
+        if goal.heard < len(goal.script.spans):
+            rest, _ = goal.script.spans[goal.heard]
+            self._goal = self._unconfirmed = None
+            self._send(protocol.Ended(goal.id, protocol.OUTCOME_INTERRUPTED, rest=rest))
 
     def _pause(self, goal: Goal, number: int) -> None:
         if "ignore-pause" in goal.script or goal.paused_at is not None:

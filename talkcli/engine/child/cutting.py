@@ -99,12 +99,14 @@ class GrowingText:
     It keeps track of how much of the text was passed to the synthesizer.
     """
 
-    def __init__(self, text: str, *, ended: bool) -> None:
+    def __init__(self, text: str, *, ended: bool, start: int = 0) -> None:
+        """Begin to cut the text at the offset `start`."""
         #: the whole text so far, with the sender's offsets
         self.text = text
         #: whether no more text will be added
         self.ended = ended
-        self._position = 0
+        #: offset up to which the synthesizer has received the text
+        self.position = start
         #: offset up to which the text after the position was searched without finding the end of a sentence
         self._searched = 0
         #: time of the last change; None until it is known
@@ -113,7 +115,7 @@ class GrowingText:
     @property
     def finished(self) -> bool:
         """Whether the text is complete and the synthesizer has received all of it."""
-        return self.ended and not self.text[self._position :].strip()
+        return self.ended and not self.text[self.position :].strip()
 
     def append(self, text: str, now: float) -> None:
         """Add text at the end, and record the time of the change."""
@@ -126,10 +128,10 @@ class GrowingText:
 
         Text that was already passed to the synthesizer is kept.
         """
-        position = self._position
+        position = self.position
         while (end := self._find_sentence_end(_LONG_WAIT)) is not None:
-            self._position = end
-        self.text, self._position, self.ended = self.text[: self._position], position, True
+            self.position = end
+        self.text, self.position, self.ended = self.text[: self.position], position, True
 
     def take_next_part(self, now: float, buffered_s: float) -> tuple[int, int] | None:
         """Take the next part that can be spoken now. Return its start and end, or None.
@@ -146,12 +148,12 @@ class GrowingText:
         end = self._find_part_end(now, now + buffered_s)
         if end is None:
             return None
-        start, self._position = self._position, end
+        start, self.position = self.position, end
         return start, end
 
     def skip_to(self, end: int) -> None:
         """Extend the last part to an offset, so that the next part begins there."""
-        self._position = max(self._position, end)
+        self.position = max(self.position, end)
 
     def next_part_at(self, now: float, buffered_s: float) -> float:
         """Return the time at which the next part can be spoken if no more text is added.
@@ -174,9 +176,9 @@ class GrowingText:
             silent_at: the time at which the player becomes silent.
         """
         text = self.text
-        start = len(text) - len(text[self._position :].lstrip())
-        if self._position or not self.ended:
-            self._position = start
+        start = len(text) - len(text[self.position :].lstrip())
+        if self.position or not self.ended:
+            self.position = start
         if self.ended:
             return len(text) if start < len(text) else None
         if self._changed_at is None:
@@ -201,9 +203,9 @@ class GrowingText:
 
         `waited` says how long the text has stayed the same. It is one of the constants such as `_SHORT_WAIT`.
         """
-        for found in _SENTENCE_END.finditer(self.text, max(self._position, self._searched)):
+        for found in _SENTENCE_END.finditer(self.text, max(self.position, self._searched)):
             self._searched = found.start()
-            needed = _required_wait(self.text, self._position, found)
+            needed = _required_wait(self.text, self.position, found)
             if needed <= waited:
                 return found.start() if "\n" in found.group() else found.end()
             if needed < _NEVER:

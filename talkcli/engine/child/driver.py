@@ -15,7 +15,7 @@ from math import inf
 from talkcli import install
 from talkcli.engine import protocol, voices
 from talkcli.engine.child.playback import Playback
-from talkcli.engine.child.players.base import CannotSpeak, Stopped
+from talkcli.engine.child.players.base import CannotSpeak, EndedEarly, Stopped
 from talkcli.engine.child.synthesizers.base import NotInstalled, SpeechSettings
 from talkcli.engine.voices import SYNTHESIZERS, UnknownVoice, is_own_driver
 from talkcli.frozen import TYPE_CHECKING, fields, replace
@@ -335,8 +335,13 @@ class Driver:
         self._playback = playback = Playback(runner, self._notify_word)
         runner.duration = None
         try:
-            length = self._write_samples(text, playback)
-            runner.duration = round(min(playback.finish(), length), 6)
+            try:
+                length = self._write_samples(text, playback)
+                runner.duration = round(min(playback.finish(), length), 6)
+            except EndedEarly as early:
+                runner.ended_early = early
+                if playback.started:
+                    playback.finish()
             runner.gaps = playback.gaps
         except Stopped:
             pass
@@ -369,9 +374,11 @@ class Driver:
         """
         growing, apply = self._runner.growing_text, self._runner.pronunciations.apply
         if growing is None:
-            yield apply(text), True
+            yield apply(text, self._runner.text_start), True
             return
         while True:
+            if self._runner.word_end_due is not None and not growing.finished:
+                raise EndedEarly(growing.position)
             now, buffered = time.monotonic(), playback.buffered()
             part = growing.take_next_part(now, buffered)
             if part is not None:
@@ -386,6 +393,6 @@ class Driver:
                 playback.await_text(min(growing.next_part_at(now, buffered), now + buffered if buffered > 0 else NEVER))
 
     def _notify_word(self, word: TimedWord) -> None:
-        """Store a word's audio position in the runner, and notify pyttsx3 of the word."""
-        self._runner.position = word.position
-        self._proxy.notify("started-word", location=word.location, length=word.length)
+        """Store a word in the runner, and notify pyttsx3 of the word."""
+        self._runner.word = word
+        self._proxy.notify("started-word", location=word.start, length=word.end - word.start)

@@ -10,7 +10,7 @@ import select
 import time
 from array import array
 
-from talkcli.engine.child.players.base import CannotKillPlayer, CannotSpeak, Stopped
+from talkcli.engine.child.players.base import CannotKillPlayer, CannotSpeak, EndedEarly, Stopped
 from talkcli.engine.child.words import TimedWord, WordClock
 from talkcli.engine.players import PIECE_S, SAMPLE_BYTES
 from talkcli.frozen import TYPE_CHECKING, replace
@@ -77,6 +77,9 @@ RELEASE_DELAY_S = 10.0
 #: 78 ms, and pacat 25 to 60 ms.
 MIN_PLAYER_BUFFER_S = 0.02
 
+#: Length of the fade at the end of an interrupted word. Without it, a click would be heard.
+FADE_S = 0.005
+
 #: Samples up to this absolute value count as silence. This is 66 dB below the loudest possible sample (32,768).
 #: libespeak-ng ends a sentence with 235 to 275 ms of zeros. If the voice has an echo ("f3"), the last 100 ms or so are
 #: quiet, but not zero.
@@ -122,6 +125,15 @@ class SentenceSamples:
         Release it before adding or dropping samples.
         """
         return memoryview(self._kept)[begin - self.begin : end - self.begin]
+
+    def end_at(self, offset: int, fade_begin: int) -> None:
+        """Drop the samples after an offset, and fade out those between `fade_begin` and the offset."""
+        faded = array("h", bytes(self.view(fade_begin, offset)))
+        count = len(faded)
+        faded = array("h", (int(each * (count - 1 - at) / count) for at, each in enumerate(faded)))
+        del self._kept[fade_begin - self.begin :]
+        self._quiet = 0
+        self.add(faded.tobytes())
 
     def drop_until(self, offset: int) -> None:
         """Drop the samples before this offset."""
@@ -292,7 +304,7 @@ class Playback:
         self.gaps: list[float] = []
         #: time at which the player began to play silence during a pause
         self._silent_at: float | None = None
-        #: seconds of the sentence that had been heard when it was stopped; None before that
+        #: seconds of the sentence that had been heard when it was stopped or finished; None before that
         self._heard: float | None = None
 
     # -- methods for the synthesizer
@@ -324,7 +336,7 @@ class Playback:
         self.begin(rate, "")
 
     def word(self, start: int, length: int, audio_start: float) -> None:
-        """Schedule a word to be reported when it is heard.
+        """Schedule a word to be reported when it is heard, if it is a new word.
 
         Args:
             start: offset of the word in the current part of the text, as it is said.
@@ -333,8 +345,8 @@ class Playback:
         """
         self._samples.audible = True
         located = self._part.locate(start, length) if self._part else (start, length)
-        if located:
-            self._clock.add(TimedWord(*located, self._seconds(self._part_begin) + audio_start))
+        if located and (found := self._runner.find_word(*located)):
+            self._clock.add(TimedWord(*found, self._seconds(self._part_begin) + audio_start))
 
     def write(self, samples: bytes) -> None:
         """Send samples to the player, except silence at the end. Wait until it has accepted them.
@@ -377,7 +389,7 @@ class Playback:
         self._keep_playing(until=until)
 
     def finish(self) -> float:
-        """Play the sentence to its end. Return its length in seconds.
+        """Play all samples to their end. Return their length in seconds.
 
         If any part of the sentence wasn't heard, this method raises CannotSpeak.
         """
@@ -389,7 +401,13 @@ class Playback:
         if self._feed is not None:
             feed, now = self._feed, time.monotonic()
             self._players.handovers.sentence_ended(feed.player.name, now + feed.time_left(feed.written, now))
-        return self._seconds(self._sent - self._skipped)
+        self._heard = self._seconds(self._sent - self._skipped)
+        return self._heard
+
+    @property
+    def started(self) -> bool:
+        """Whether any samples of the sentence were sent to a player."""
+        return self._sent > self._skipped
 
     def heard(self) -> float:
         """Return how many seconds of the sentence were heard or written to a file."""
@@ -439,7 +457,7 @@ class Playback:
         released during a pause, a new one is opened.
         """
         while True:
-            self._raise_if_stopped()
+            self._raise_if_ended()
             try:
                 if self._feed is None:
                     self._wait_for_continue()
@@ -759,9 +777,36 @@ class Playback:
     def _wait(self, interests: Sequence[Interest] = (), until: float = NEVER) -> None:
         """Wait, and execute commands meanwhile. Raise Stopped if the sentence was stopped."""
         self._runner.wait(interests, until)
-        self._raise_if_stopped()
+        self._raise_if_ended()
 
-    def _raise_if_stopped(self) -> None:
-        """Raise Stopped if the sentence was stopped."""
+    def _raise_if_ended(self) -> None:
+        """Raise Stopped if the sentence was stopped, or EndedEarly if it was interrupted and can end now."""
         if self._stopped:
             raise Stopped
+        if self._runner.word_end_due is not None and not self._complete:
+            self._end_early(self._runner.word_end_due - time.monotonic())
+
+    def _end_early(self, time_left: float) -> None:
+        """End the samples where the next word begins, and raise EndedEarly.
+
+        Do nothing if the next word isn't known yet, or if it begins too late. `time_left` is the time in seconds in
+        which the current word must end. After that, the word is cut off.
+        """
+        if not self.started:
+            raise EndedEarly
+        sent = self._seconds(self._sent)
+        word = self._clock.next_word_from(sent)
+        if word is not None and word.position > sent + time_left:
+            word = None
+        if word is None and time_left > 0:
+            return
+        position = sent if word is None else word.position
+        faded = int(FADE_S * self._rate) * SAMPLE_BYTES
+        end = max(self._sent + faded, round(position * self._rate) * SAMPLE_BYTES)
+        if end > self._samples.end:
+            if time_left > 0:
+                return
+            end = self._samples.end
+        self._samples.end_at(end, max(self._sent, end - faded))
+        self._clock.drop_from(position)
+        raise EndedEarly(None if word is None else word.start)

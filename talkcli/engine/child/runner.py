@@ -18,10 +18,10 @@ import traceback
 
 from talkcli.engine import protocol
 from talkcli.engine.child.players.base import CannotSpeak
-from talkcli.engine.child.words import WordFinder
+from talkcli.engine.child.words import TimedWord, WordFinder
 from talkcli.engine.pronunciation import Pronunciations
 from talkcli.engine.voices import list_voices
-from talkcli.frozen import TYPE_CHECKING
+from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.options import MARKDOWN, SOUND
 from talkcli.goals.reasons import Reason
 from talkcli.polling import NEVER, wait_ready
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from talkcli.engine.child.cutting import GrowingText
-    from talkcli.engine.child.players.base import Interest
+    from talkcli.engine.child.players.base import EndedEarly, Interest
     from talkcli.engine.child.players.chooser import PlayerChooser
     from talkcli.engine.child.synthesizers.combined import CombinedSynthesizer
     from talkcli.engine.markdown import MarkdownReader
@@ -50,6 +50,9 @@ DRIVER_LIMIT_S = 10.0
 #: Maximum number of words expected for each remaining character. "€" is spoken as one word. An emoji is spoken as up to
 #: five words, but a text rarely consists of emojis only.
 MAX_WORDS_PER_CHARACTER = 3
+#: Time allowed for the current word to end after an `Interrupt`. libespeak-ng speaks a number of 16 digits as one word,
+#: which takes 8 s. A longer word is cut off, and repeated when the goal continues.
+WORD_END_LIMIT_S = 1.0
 #: How many characters must arrive before the server is told again that text is missing.
 REPORTED_CHARS = 1_000
 
@@ -110,19 +113,19 @@ class ActiveGoal:
         self.spoken_text: SpokenText | None = None
         #: number of characters received, and how many of them the server knows to be received
         self.length, self.reported_length = len(command.text), 0
-        self.words = WordFinder(self.text)
+        self.words = WordFinder(self.text, max(command.start, command.heard_end), command.heard_words)
         #: time at which the driver last received text
         self.resumed_at = now
         #: seconds of speech before `resumed_at`, if a third-party driver was paused
-        self.spoken_s = 0.0
+        self.spoken_s = command.heard
         #: time at which the driver last received text or reported a word
         self.progress_at = now
         #: whether the driver is speaking the text; False while a third-party driver is paused
         self.with_driver = False
-        #: whether a third-party driver was stopped in order to pause the goal
+        #: whether a third-party driver was stopped in order to pause or interrupt the goal
         self.interrupted = False
         #: offset in the text of the last word heard
-        self.last_word = 0
+        self.last_word = command.start
         self.stop_requested = False
         #: the last output and the last voice reported to the server
         self.reported_output: Output | None = None
@@ -180,13 +183,17 @@ class GoalRunner:
         self._synthesizer: CombinedSynthesizer | None = None
         #: number of the current pause, or 0; read by the playback, because pyttsx3 has no method for pausing
         self.hold_number = 0
+        #: time by which the current word must end, because the goal was interrupted; None otherwise
+        self.word_end_due: float | None = None
         # Only `talk`'s own driver sets these attributes. pyttsx3's notifications have no fields for them.
-        #: position in the audio of the word being reported, in seconds; None with a third-party driver
-        self.position: float | None = None
+        #: the word being reported; None with a third-party driver
+        self.word: TimedWord | None = None
         #: length of the last sentence in seconds; None if it wasn't heard completely
         self.duration: float | None = None
         #: seconds of the last sentence that were heard; None if unknown
         self.heard: float | None = None
+        #: how the last sentence was interrupted; None if it wasn't
+        self.ended_early: EndedEarly | None = None
         #: lengths in seconds of the gaps in the last sentence
         self.gaps: list[float] = []
 
@@ -270,23 +277,34 @@ class GoalRunner:
                 self._synthesizer.load_or_unload(command)
         elif isinstance(command, protocol.GoalCommand):
             self._begin_goal(command)
-        elif goal is None or isinstance(command, protocol.Configure) or goal.id != command.id:
-            return
-        elif isinstance(command, protocol.Stop):
-            self._stop_goal()
-        elif isinstance(command, protocol.Append):
-            goal.append(command, time.monotonic())
-        elif isinstance(command, protocol.NextGoal):
-            handovers = self.players.handovers
-            handovers.next_waits, handovers.next_is_neural = command.next_waits, command.next_is_neural
-        elif isinstance(command, protocol.Continue):
-            self.hold_number = 0
-        elif not goal.stop_requested:
-            self._pause(goal, command.number)
+        elif goal is not None and not isinstance(command, protocol.Configure) and goal.id == command.id:
+            self._execute_for_goal(goal, command)
 
-    def _pause(self, goal: ActiveGoal, hold_number: int) -> None:
-        """Pause the current goal. A third-party driver is stopped, because it can't be paused."""
-        self.hold_number = hold_number
+    def _execute_for_goal(self, goal: ActiveGoal, command: protocol.ActiveGoalCommand) -> None:
+        """Execute a command for the current goal."""
+        match command:
+            case protocol.Stop():
+                self._stop_goal()
+            case protocol.Append():
+                goal.append(command, time.monotonic())
+            case protocol.NextGoal():
+                handovers = self.players.handovers
+                handovers.next_waits, handovers.next_is_neural = command.next_waits, command.next_is_neural
+            case protocol.Interrupt():
+                self.word_end_due = time.monotonic() + WORD_END_LIMIT_S
+                self._interrupt_driver(goal)
+            case protocol.Continue():
+                self.hold_number = 0
+            case protocol.Hold():
+                if not goal.stop_requested:
+                    self.hold_number = command.number
+                    self._interrupt_driver(goal)
+
+    def _interrupt_driver(self, goal: ActiveGoal) -> None:
+        """Stop a third-party driver, because it can't be paused.
+
+        In `talk`'s own driver, the playback handles pauses and interruptions.
+        """
         if self._step_run_loop is not None and goal.with_driver and not goal.interrupted:
             goal.interrupted = True
             self._engine.stop()
@@ -312,6 +330,19 @@ class GoalRunner:
         if goal is not None and voice != goal.reported_voice:
             goal.reported_voice = voice
             self._channel.send(protocol.VoiceChosen(goal.id, voice, fallback_reason or goal.fallback_reason))
+
+    def find_word(self, location: int, length: int) -> tuple[int, int, int] | None:
+        """Find the word at a location in the current goal's text.
+
+        Return the word's start, end and number, or None if it is not a new word.
+        """
+        assert self._goal
+        return self._goal.words.find(location, length)
+
+    @property
+    def text_start(self) -> int:
+        """Offset at which the speech of the current goal begins, if it was interrupted before."""
+        return self._goal.command.start if self._goal else 0
 
     @property
     def pronunciations(self) -> Pronunciations:
@@ -364,6 +395,7 @@ class GoalRunner:
         """Make a new goal the current one, and tell the server that it has started."""
         self._goal = ActiveGoal(command, time.monotonic())
         self.hold_number, self.duration, self.heard, self.gaps = 0, None, None, []
+        self.word_end_due = self.ended_early = None
         self.players.begin_goal(command)
         self._channel.send(protocol.Started(command.id))
 
@@ -385,6 +417,8 @@ class GoalRunner:
         while self._goal is goal:
             if goal.with_driver:
                 self._step_driver(goal)
+            elif self._step_run_loop is not None and self.word_end_due is not None:
+                self._end_goal(protocol.OUTCOME_INTERRUPTED)
             elif self._step_run_loop is not None and self.hold_number:
                 self.confirm_hold()
                 self.wait()
@@ -429,12 +463,16 @@ class GoalRunner:
         goal = self._goal
         if goal is None or goal.stop_requested or goal.interrupted:
             return
-        located = goal.spoken_text.locate(location, length) if goal.spoken_text else (location, length)
-        if located and location >= 0 and (found := goal.words.find(*located)):
-            start, end, number = found
-            goal.last_word, goal.progress_at = start, time.monotonic()
-            seconds = goal.speech_seconds(goal.progress_at) if self.position is None else self.position
-            self._channel.send(protocol.Word(goal.id, start, end, number, round(seconds, 3)))
+        goal.progress_at, word = time.monotonic(), self.word
+        if word is not None:
+            word = replace(word, position=word.position + goal.command.heard)
+        else:
+            located = goal.spoken_text.locate(location, length) if goal.spoken_text else (location, length)
+            if located and location >= 0 and (found := self.find_word(*located)):
+                word = TimedWord(*found, goal.speech_seconds(goal.progress_at))
+        if word is not None:
+            goal.last_word = word.start
+            self._channel.send(protocol.Word(goal.id, word.start, word.end, word.number, round(word.position, 3)))
 
     def _record_error(self, exception: Exception, **_: object) -> None:
         """Store the first error that the driver reports for the current goal."""
@@ -442,7 +480,7 @@ class GoalRunner:
             self._goal.error = exception
 
     def _handle_driver_finished(self, name: str | None, completed: bool, **_: object) -> None:
-        """End the goal when the driver has finished, unless a pause has stopped the driver."""
+        """End the goal when the driver has finished, unless a pause or an interruption has stopped the driver."""
         goal = self._goal
         if goal is None or name != goal.id:  # the notification is for an earlier goal
             return
@@ -456,6 +494,8 @@ class GoalRunner:
             self._fail_goal(error.reason, str(error))
         elif goal.stop_requested:
             self._end_goal(protocol.OUTCOME_STOPPED)
+        elif self.ended_early:
+            self._end_goal(protocol.OUTCOME_INTERRUPTED)
         elif error is None:
             self._fail_goal(Reason.ENGINE_FAILED, "the driver stopped before the end of the sentence")
         else:
@@ -471,10 +511,18 @@ class GoalRunner:
         assert self._goal is not None
         self._report_output()
         goal, self._goal = self._goal, None
-        heard = self.heard if self._step_run_loop is None else round(goal.speech_seconds(time.monotonic()), 3)
+        before, duration, heard = goal.command.heard, self.duration, self.heard
+        duration = None if duration is None else round(before + duration, 6)
+        heard = None if heard is None else round(before + heard, 3)
+        if self._step_run_loop is not None:
+            heard = round(goal.speech_seconds(time.monotonic()), 3)
         gaps = len(self.gaps), round(sum(self.gaps), 3)
+        rest = None
+        if outcome == protocol.OUTCOME_INTERRUPTED:
+            rest = self.ended_early.rest if self.ended_early else None
+            rest = goal.last_word if rest is None else rest
         player = self.players.last_player
-        ended = protocol.Ended(goal.id, outcome, reason, message, self.duration, *gaps, player, heard)
+        ended = protocol.Ended(goal.id, outcome, reason, message, duration, *gaps, player, heard, rest)
         self._channel.send(ended)
 
     def _next_heartbeat_at(self) -> float:
@@ -518,7 +566,7 @@ def _make_growing_text(text_so_far: str, command: protocol.Speak) -> GrowingText
     """
     from talkcli.engine.child.cutting import GrowingText  # rarely needed, and slow to import
 
-    text = GrowingText(text_so_far, ended=False)
+    text = GrowingText(text_so_far, ended=False, start=command.start)
     if command.broken:
         text.drop_incomplete()
     return text

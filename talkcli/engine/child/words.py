@@ -40,11 +40,12 @@ class WordFinder:
     spoken as one ("in the"), it returns only the first. The end of the pair isn't known until the next report.
     """
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text: str, end: int = 0, count: int = 0) -> None:
+        """Begin with the words after `end`. `count` words have been found before."""
         #: the text, which may grow at the end
         self.text = text
-        self._end = 0
-        self._count = 0
+        self._end = end
+        self._count = count
 
     def find(self, location: int, length: int) -> tuple[int, int, int] | None:
         """Find the word at a location. Return its start, end and number if it is new.
@@ -83,8 +84,9 @@ class WordFinder:
 class TimedWord:
     """A word of the text, with its position in the audio."""
 
-    location: int  # offset of the first character in the text
-    length: int  # number of characters
+    start: int  # offset of the first character in the text
+    end: int  # offset after the last character
+    number: int  # number of the word in the text, starting at 1
     position: float  # position at which the word starts in the audio, in seconds
 
 
@@ -108,6 +110,14 @@ class WordClock:
     def add(self, word: TimedWord) -> None:
         """Add a word. Words must be added in the order of their positions."""
         self._waiting.append(word)
+
+    def next_word_from(self, position: float) -> TimedWord | None:
+        """Return the first waiting word at this position or after it, if any."""
+        return next((each for each in self._waiting if each.position >= position), None)
+
+    def drop_from(self, position: float) -> None:
+        """Remove the words at this position and after it."""
+        self._waiting = deque(each for each in self._waiting if each.position < position)
 
     def delay_words_until(self, position: float) -> None:
         """Let no word begin before this position in the audio."""

@@ -172,6 +172,8 @@ class SupervisedGoal:
     retried: bool = False
     #: time by which the process must confirm a `Stop`; NEVER if none was sent
     stop_due: float = NEVER
+    #: whether the goal must end at the end of a word
+    interrupted: bool = False
     #: number of the current pause; None if the goal is not paused
     hold_number: int | None = None
     #: time by which the process must confirm a `Hold`; NEVER if none is waiting for confirmation
@@ -233,6 +235,13 @@ class Supervisor:
     def stop(self, goal_id: str) -> None:
         """Stop the goal. Its `Ended` is posted once it has stopped."""
         self._actions.call(lambda: self._stop_goal(goal_id))
+
+    def interrupt(self, goal_id: str) -> None:
+        """End the goal at the end of the current word. Its `Ended` is posted at that time.
+
+        If no word follows, the goal ends as usual.
+        """
+        self._actions.call(lambda: self._interrupt_goal(goal_id))
 
     def pause(self, goal_id: str, number: int) -> None:
         """Pause the goal. Post `Held` with this number once the goal is silent.
@@ -431,6 +440,17 @@ class Supervisor:
             goal.stop_due = time.monotonic() + STOP_LIMIT_S
             self._send(protocol.Stop(goal_id))
 
+    def _interrupt_goal(self, goal_id: str) -> None:
+        """Interrupt the goal. If it wasn't sent to the process, end it at once."""
+        goal = self._current_goal(goal_id)
+        if goal is None or goal.stop_due != NEVER or goal.end:
+            return
+        goal.interrupted = True
+        if goal.sent:
+            self._send(protocol.Interrupt(goal_id))
+        else:
+            self._end_goal(_interrupted_before_start(goal))
+
     def _give_up_goal(self, goal_id: str) -> None:
         """Forget the goal without posting its `Ended`, and replace the process that is speaking it."""
         goal = self._current_goal(goal_id)
@@ -551,6 +571,8 @@ class Supervisor:
             goal.retried = True
             if goal.hold_number is not None:
                 self._post(protocol.Held(goal.command.id, goal.hold_number))
+            if goal.interrupted:
+                goal.end, goal.lost_process = _interrupted_before_start(goal), process
         else:
             goal.end = protocol.Ended(goal.command.id, protocol.OUTCOME_FAILED, reason, message)
             if goal.stop_due != NEVER:
@@ -590,3 +612,8 @@ class Supervisor:
         for process in self._dying:
             process.close()
         self._actions.close()
+
+
+def _interrupted_before_start(goal: SupervisedGoal) -> protocol.Ended:
+    """Return the end of a goal that was interrupted before any of it was heard."""
+    return protocol.Ended(goal.command.id, protocol.OUTCOME_INTERRUPTED, rest=goal.command.start)

@@ -39,6 +39,18 @@ class Stopped(Exception):
     """Raised by the playback if the sentence was stopped."""
 
 
+class EndedEarly(Exception):
+    """Raised if an `Interrupt` ends the sentence.
+
+    Args:
+        rest: The offset at which the text continues, or None to repeat the last word that was heard.
+    """
+
+    def __init__(self, rest: int | None = None) -> None:
+        super().__init__()
+        self.rest = rest
+
+
 class CannotKillPlayer(Exception):
     """Raised if a killed player has not exited in time.
 
