@@ -96,6 +96,7 @@ class Client:
         *,
         preempt: bool | None = None,
         flush: bool = False,
+        interject: bool = False,
         priority: int = 0,
         ttl: float | None = None,
         key: str | None = None,
@@ -123,6 +124,7 @@ class Client:
             text: the text to speak, up to 10,000 characters.
             preempt: stop the active goal, and speak this one first. None means the server's setting.
             flush: like `preempt`, and also recall all pending goals of the same or a lower priority.
+            interject: interrupt the active goal at the end of a word. It continues with its next word afterwards.
             priority: goals with a higher priority are spoken first.
             ttl: seconds in which speaking must begin. Otherwise the goal is RECALLED. 0 means no limit, and None the
                 server's setting.
@@ -152,7 +154,7 @@ class Client:
 
         Raises:
             UsageError: a value is out of its range. Nothing was sent.
-            ProtocolMismatch: the server is too old for Markdown or sounds. Nothing was sent.
+            ProtocolMismatch: the server is too old for Markdown, sounds or interjections. Nothing was sent.
             ServerUnavailable: the server can't be reached. Nothing was sent. With `block=False`, this is raised only
                 if the client is closed.
             Lost: the goal was sent, but the server didn't answer. The goal may be spoken.
@@ -207,6 +209,7 @@ class Client:
         *,
         preempt: bool | None = None,
         flush: bool = False,
+        interject: bool = False,
         priority: int = 0,
         ttl: float | None = None,
         key: str | None = None,
@@ -242,7 +245,7 @@ class Client:
 
         Raises:
             UsageError: a value is out of its range.
-            ProtocolMismatch: the server is too old for growing texts.
+            ProtocolMismatch: the server is too old for growing texts, Markdown or interjections.
         """
         given = {name: value for name, value in locals().items() if name != "self"}
         say = self._calls._stream_request(**given)

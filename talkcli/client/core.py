@@ -169,7 +169,7 @@ class EventListeners:
             for tracked in self._goals.pop(event.goal.id, set()):
                 tracked._update(event.goal)
             return
-        if isinstance(event, StateChanged | WordHeard | events.TextMissing | PausedChanged):
+        if isinstance(event, StateChanged | WordHeard | events.TextMissing | events.Interrupted | PausedChanged):
             for goal_id in self._goals if isinstance(event, PausedChanged) else [event.id]:
                 for tracked in self._goals.get(goal_id, set()):
                     tracked._hear(event)
@@ -255,7 +255,9 @@ class TrackedGoal:
         if not self.goal.state.terminal:
             self.goal = goal
 
-    def _hear(self, event: StateChanged | WordHeard | events.TextMissing | PausedChanged | Goal) -> None:
+    def _hear(
+        self, event: StateChanged | WordHeard | events.TextMissing | events.Interrupted | PausedChanged | Goal
+    ) -> None:
         """Update the goal from an event, and buffer the event."""
         if self.goal.state.terminal:
             return
@@ -264,15 +266,19 @@ class TrackedGoal:
                 self._buffer.add(StateChanged(event.id, event.state))
             self.goal = event
         elif isinstance(event, StateChanged):
-            # A terminal state is followed by the Result, which has more details.
+            # A terminal state is followed by the Result, which has more details. If the goal was interrupted, it
+            # continues or is being stopped.
             if not event.state.terminal:
-                self.goal = replace(self.goal, state=event.state)
+                paused = self.goal.paused and self.goal.interrupted_by is None
+                self.goal = replace(self.goal, state=event.state, paused=paused, interrupted_by=None)
             self._buffer.add(event)
         else:
             if isinstance(event, PausedChanged):
                 self.speech_paused = event.paused
                 paused = event.paused and event.id == self.goal.id and self.goal.state is State.ACTIVE
-                self.goal = replace(self.goal, paused=paused)
+                self.goal = replace(self.goal, paused=paused or self.goal.interrupted_by is not None)
+            elif isinstance(event, events.Interrupted):
+                self.goal = replace(self.goal, paused=True, interrupted_by=event.by.goal)
             elif isinstance(event, events.TextMissing):
                 self.goal = replace(self.goal, waits=event.waits)
             if self._with_feedback:

@@ -124,6 +124,8 @@ class Goal:
     data: JsonObject | None = None
     client: Sender | None = None
     paused: bool = False
+    #: id of the goal that is spoken in the middle of this one, which continues afterwards
+    interrupted_by: str | None = None
     #: whether the text may still grow
     more: bool = False
     #: whether the goal is silent because the next part of its text is missing
@@ -164,6 +166,7 @@ class Goal:
             "data": self.data,
             "client": None if self.client is None else self.client.to_json(),
             "paused": self.paused,
+            "interrupted_by": self.interrupted_by,
             "more": self.more,
             "waits": self.waits,
             "queued_at": self.queued_at,

@@ -414,6 +414,14 @@ OPTIONS = (
         help="Interrupt the current sentence, and empty the queue.",
     ),
     Option(
+        "interject",
+        FLAG,
+        "interrupt the current goal at the end of a word, unless it has a higher priority. Afterwards, that goal "
+        "continues with its next word",
+        default=False,
+        help="Interrupt the current sentence at the end of a word. It continues afterwards.",
+    ),
+    Option(
         "priority",
         INTEGER,
         "goals with a higher priority are spoken first, and goals with the same priority in the order of arrival",
@@ -619,6 +627,7 @@ class Say:
     patient: bool = False
     preempt: bool | None = None
     flush: bool = False
+    interject: bool = False
     priority: int = 0
     ttl: float | None = None
     key: str | None = None
@@ -841,6 +850,8 @@ def bad_option(request: Say | Set | Pause | Log) -> str | None:
     """Return an error message if a request has a value or combination that is not allowed."""
     if isinstance(request, Say) and request.flush and request.preempt is False:
         return "flush can't be combined with preempt false, because it always interrupts"
+    if isinstance(request, Say) and request.interject and (request.flush or request.preempt):
+        return f"interject can't be combined with {'flush' if request.flush else 'preempt'}, which ends other goals"
     if isinstance(request, Say) and request.more and request.throttle is not None and request.key is None:
         return "a growing text can only be throttled by its key, because its whole text isn't known yet"
     is_sound = isinstance(request, Say) and request.is_sound

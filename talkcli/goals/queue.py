@@ -1,8 +1,8 @@
 """The queue of pending goals, in the order in which they will be spoken.
 
 Higher priorities come first. Goals of the same priority keep the order in which they were accepted, except that a goal
-may be put at the front of its priority or take the place of another goal. If the queue is full, it can name a goal to
-displace, and the scheduler decides whether to do so.
+may take the place of another goal, and that preempting goals come first, followed by interjections. If the queue is
+full, it can name a goal to displace, and the scheduler decides whether to do so.
 
 The queue may contain ten thousand goals (`--max-queue`). Methods called for each goal use binary search unless their
 docstring says otherwise.
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     _Entry = tuple[float, int, Record]
 
 _record_of = itemgetter(2)
+#: Difference between the positions of preempting goals, interjections and other goals, more than a server has goals.
+_POSITIONS = 2**40
 
 
 class Queue:
@@ -34,6 +36,8 @@ class Queue:
         self._goals: list[_Entry] = []
         #: preempting goals, sorted by descending priority and then by position
         self._preempting: list[_Entry] = []
+        #: interjections, sorted by descending priority and then by position
+        self._interjections: list[_Entry] = []
         #: all goals, sorted by descending priority and then by age; the last goal is displaced first
         self._displaceable: list[_Entry] = []
         #: goals with a time to live, sorted by expiry time
@@ -49,6 +53,10 @@ class Queue:
     def first(self) -> Record | None:
         """Return the next goal to speak, or None if the queue is empty."""
         return self._goals[0][2] if self._goals else None
+
+    def interjections(self) -> Iterator[Record]:
+        """Return an iterator over the pending interjections in their order."""
+        return map(_record_of, self._interjections)
 
     def with_key(self, key: str | None) -> Record | None:
         """Return the pending goal with this key, if any.
@@ -79,13 +87,15 @@ class Queue:
     def add(self, record: Record, replaced: Record | None = None) -> None:
         """Add a goal to the queue, at the place of the already removed goal `replaced`, if any.
 
-        Otherwise, its place is behind the other goals of its priority, or in front of them if the goal preempts.
+        Otherwise, its place is behind the other goals of its kind and priority, or in front of them if it preempts.
 
         Args:
             record: the new goal.
             replaced: a goal of the same priority that was removed. The new goal takes its place in the queue.
         """
-        usual = -record.number if record.preempt else record.number
+        usual = record.number - _POSITIONS * record.say.interject
+        if record.preempt:
+            usual = -2 * _POSITIONS - record.number
         record.position = replaced.position if replaced else usual
         for goals, entry in self._entries(record):
             insort(goals, entry)
@@ -114,5 +124,7 @@ class Queue:
         yield self._displaceable, (-record.say.priority, record.number, record)
         if record.preempt:
             yield self._preempting, entry
+        if record.say.interject:
+            yield self._interjections, entry
         if record.expires_at < inf:
             yield self._expiries, (record.expires_at, record.number, record)

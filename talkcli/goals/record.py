@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.frozen import replace
 from talkcli.goals.goal import By, Goal, Output, Sender
-from talkcli.goals.options import SHOWN_OPTIONS, Say, require_fields
+from talkcli.goals.options import SHOWN_OPTIONS, Say, Set, require_fields
 from talkcli.goals.states import TRANSITIONS, IllegalTransition, State
 
 if TYPE_CHECKING:
@@ -69,8 +69,19 @@ class Record:
     passed_chars: int = 0
     #: monotonic time by which more text must arrive, or inf
     stalls_at: float = inf
-    #: whether the goal is paused
+    #: whether the goal is paused or interrupted
     paused: bool = False
+    #: id of the goal that interrupts this one, or None
+    interrupted_by: str | None = None
+    #: offset in the text at which the speech continues after the last interruption, or 0
+    rest: int = 0
+    #: number of words that have started
+    word_count: int = 0
+    #: number of gaps in the audio before the last interruption, and their total length in seconds
+    gaps: int = 0
+    gap_seconds: float = 0.0
+    #: the server's settings at the time when the goal became ACTIVE, or None before that
+    settings: Set | None = None
     #: how often the goal has been paused
     pause_count: int = 0
     #: monotonic time at which the goal reached the front of the queue, or inf before that
@@ -142,6 +153,7 @@ class Record:
             text=text,
             client=self.sender,
             paused=self.paused and state is self.state,
+            interrupted_by=self.interrupted_by if state is self.state else None,
             more=self.more,
             waits=self.waits,
             queued_at=self.queued_at,

@@ -5,8 +5,9 @@ either does everything or raises an error and changes nothing. The caller must c
 the order in which they were returned, and publish the state changes in their order. Only this package changes the
 scheduler and its records.
 
-At most one goal is ACTIVE or PREEMPTING at any time. The next goal starts only after that goal has ended, and only with
-an engine and while speech is not paused. Every goal ends exactly once.
+At most one goal is spoken or stopped at any time. The next goal starts only after that goal has ended or was
+interrupted, and only with an engine and while speech is not paused. Interrupted goals stay ACTIVE, and continue later.
+Every goal ends exactly once.
 """
 
 from __future__ import annotations
@@ -37,6 +38,8 @@ _BROKEN_OFF = "the text broke off before its end"
 _STOP_CAUSES = {Reason.CANCELED: "the goal was cancelled", Reason.SHUTDOWN: "the server was stopped"}
 #: Time limit for the engine to become silent after a stop. Every cancel must be answered within 2 s.
 CONFIRM_SILENCE_S = 1.9
+#: Maximum number of interrupted goals. With more of them, nobody could follow.
+MAX_INTERRUPTED = 8
 
 
 @frozen
@@ -57,6 +60,17 @@ class StateChange:
 
     record: Record
     state: State
+
+
+@frozen
+class Interruption:
+    """An effect that publishes which goal interrupts this one.
+
+    When the goal continues, a StateChange to ACTIVE follows.
+    """
+
+    record: Record
+    interrupted_by: str
 
 
 @frozen
@@ -93,6 +107,8 @@ class Order(Enum):
     START = "Start"
     #: become silent, then report that the goal has ended
     STOP = "Stop"
+    #: become silent at the end of a word, then report where the text continues
+    INTERRUPT = "Interrupt"
     #: speak the text that was added, and stop waiting for more if the text has ended or broken off
     APPEND = "Append"
     #: replace the engine process, because it did not become silent in time
@@ -110,15 +126,15 @@ class EngineOrder:
     order: Order
 
 
-Effect = StateChange | PauseChange | EngineOrder | VoiceLoadOrder | VoiceDropOrder | VoiceWarning
+Effect = StateChange | Interruption | PauseChange | EngineOrder | VoiceLoadOrder | VoiceDropOrder | VoiceWarning
 
 
 @dataclass(slots=True)
 class Cancellation:
     """The goals that a cancel found, the ids it didn't find, and the effects to carry out."""
 
-    #: pending goals that this cancel has recalled
-    recalled: list[Record] = field(default_factory=list)
+    #: pending and interrupted goals, which this cancel has ended at once
+    ended_at_once: list[Record] = field(default_factory=list)
     #: the active goal, if it is being stopped
     stopping: Record | None = None
     #: requested goals that had already ended
@@ -139,6 +155,7 @@ class Scheduler:
         max_text: int = options.MAX_TEXT_CHARS,
         settings: Set = options.DEFAULTS,
         voices: VoiceScheduler | None = None,
+        can_interrupt: bool = True,
     ) -> None:
         """Create a scheduler with no goals and no engine.
 
@@ -148,6 +165,7 @@ class Scheduler:
             max_text: the maximum number of characters in a text.
             settings: the values for options that a goal omits. Every setting must have a value.
             voices: the scheduler of neural voices, or None to create one.
+            can_interrupt: whether interjections interrupt goals. Otherwise, they only go first.
         """
         self.boot = boot
         self.settings = settings
@@ -156,8 +174,13 @@ class Scheduler:
         self.pending = Queue()
         self.recent = RecentGoals()
         self.voices = voices or VoiceScheduler()
+        self._can_interrupt = can_interrupt
         #: the goal that is being spoken or stopped, or None
         self.active: Record | None = None
+        #: the goals that were interrupted and will continue; the last one continues first
+        self.interrupted: list[Record] = []
+        #: id of the interjection for which the active goal was told to end at the end of a word, or None
+        self._interrupter: str | None = None
         #: whether speech is paused
         self.paused = False
         #: the pauses that end with a connection, by that connection. None is the key of the last one of all others.
@@ -178,8 +201,23 @@ class Scheduler:
     # -- goals
 
     def unfinished(self) -> list[Record]:
-        """Return the active goal, if any, and the pending goals."""
-        return ([self.active] if self.active else []) + list(self.pending)
+        """Return the active goal, if any, the interrupted goals and the pending goals, in speaking order."""
+        return [*self.begun()[::-1], *self.pending]
+
+    def begun(self) -> list[Record]:
+        """Return the interrupted goals and the active one, if any."""
+        return [*self.interrupted, *([self.active] if self.active else [])]
+
+    def next_goal(self) -> Record | None:
+        """Return the goal that follows the active one, or None if there is none.
+
+        Interrupted goals continue before other goals start, but after interjections, unless those have a lower
+        priority.
+        """
+        if not self.interrupted:
+            return self.pending.first()
+        last = self.interrupted[-1]
+        return self._find_interjection(last.say.priority) or last
 
     def find(self, goal_id: str) -> Record | None:
         """Return the goal with this id, or None if it is unknown.
@@ -207,9 +245,11 @@ class Scheduler:
     def wanted_voice(self, record: Record) -> str:
         """Return the voice that a goal asks for, or the server's default voice.
 
-        An empty string stands for the driver's default voice. A sound needs no voice.
+        A goal that has begun keeps its voice. An empty string stands for the driver's default voice. A sound needs no
+        voice.
         """
-        return "" if record.say.is_sound else record.say.voice or self.settings.voice or ""
+        settings = record.settings or self.settings
+        return "" if record.say.is_sound else record.voice or record.say.voice or settings.voice or ""
 
     # -- requests from clients
 
@@ -271,7 +311,8 @@ class Scheduler:
             return record, effects + self._end_unqueued(record, Reason.EXPIRED, words, None, now)
         effects += self._enqueue(record, recalled or [], now)
         self._request_voice(self.wanted_voice(record), now)
-        return record, effects + self._start_next(now) + self._order_next_voice(now)
+        effects += self._start_next(now) + self._interrupt_active()
+        return record, effects + self._order_next_voice(now)
 
     def try_out(self, say: Say, sender: Sender, now: Now, server_refusal: Refusal | None) -> Record:
         """Check a goal without adding it to the queue. Return its record, which is PENDING or REJECTED and has no id.
@@ -288,8 +329,8 @@ class Scheduler:
     ) -> Cancellation:
         """Cancel goals, and unknown ones if they arrive soon. Return the affected goals and the effects.
 
-        Pending goals end at once. The active goal ends when the engine is silent. Unknown ids are
-        remembered, and a goal with such an id is cancelled if it arrives soon.
+        Pending and interrupted goals end at once. The active goal ends when the engine is silent. Unknown
+        ids are remembered, and a goal with such an id is cancelled if it arrives soon.
 
         Args:
             selection: the goals to cancel.
@@ -307,10 +348,13 @@ class Scheduler:
                 result.effects += self._recall(
                     record, Reason.CANCELED, "the goal was cancelled before it started", by, now
                 )
-                result.recalled.append(record)
-            else:
-                result.effects += self._stop(record, Reason.CANCELED, by, now)
+                result.ended_at_once.append(record)
+                continue
+            if record is self.active:
                 result.stopping = record
+            else:
+                result.ended_at_once.append(record)
+            result.effects += self._stop(record, Reason.CANCELED, by, now)
         result.effects += self._order_next_voice(now)
         return result
 
@@ -353,7 +397,7 @@ class Scheduler:
         self._orphans.pop(record, None)
         record.more = not addition.end
         self._reset_stall_limit(record, now)
-        return [EngineOrder(record, Order.APPEND)] if record.state is State.ACTIVE and (added or addition.end) else []
+        return [EngineOrder(record, Order.APPEND)] if record is self.active and (added or addition.end) else []
 
     def producer_left(self, record: Record, now: Now) -> list[Effect]:
         """End an incomplete goal whose client left, unless another may continue it. Return the effects.
@@ -377,7 +421,9 @@ class Scheduler:
             return self._recall(record, Reason.BROKEN_OFF, _BROKEN_OFF, None, now) + self._order_next_voice(now)
         record.more, record.broken = False, True
         self._reset_stall_limit(record, now)
-        return self._stop(record, Reason.BROKEN_OFF, None, now) if at_once else [EngineOrder(record, Order.APPEND)]
+        if at_once:
+            return self._stop(record, Reason.BROKEN_OFF, None, now)
+        return [EngineOrder(record, Order.APPEND)] if record is self.active else []
 
     def change_settings(self, changes: dict[str, object], now: Now) -> list[Effect]:
         """Change the settings for goals that have not started. Return the effects.
@@ -394,6 +440,8 @@ class Scheduler:
     def pause(self, client: Sender, now: Now, seconds: float | None = None, connection: object = None) -> list[Effect]:
         """Pause the active goal, and start no other goal until all pauses have ended. Return the effects.
 
+        If the goal is about to be interrupted, it becomes silent at the end of its word.
+
         Args:
             client: the client that pauses speech.
             now: the current time.
@@ -408,7 +456,7 @@ class Scheduler:
         if self.paused:
             return []
         self.paused = True
-        if self.active is None or self.active.state is not State.ACTIVE:
+        if self.active is None or self.active.state is not State.ACTIVE or self._interrupter is not None:
             return [PauseChange(True, None, client)]
         self.active.paused = True
         self.active.pause_count += 1
@@ -430,7 +478,8 @@ class Scheduler:
             return [PauseChange(False, None, client, all_ended), *self._start_next(now)]
         self.active.paused = False
         self._reset_stall_limit(self.active, now)
-        return [PauseChange(False, self.active, client, all_ended), EngineOrder(self.active, Order.RESUME)]
+        effects: list[Effect] = [PauseChange(False, self.active, client, all_ended)]
+        return [*effects, EngineOrder(self.active, Order.RESUME), *self._interrupt_active()]
 
     def end_pause(self, connection: object, now: Now) -> list[Effect]:
         """End the pause that lasts as long as a connection, if there is one. Return the effects."""
@@ -451,13 +500,13 @@ class Scheduler:
         return [] if last and last.ends_at > now.monotonic else self.resume(client, now, all_ended=True)
 
     def shutdown(self, now: Now) -> list[Effect]:
-        """End all pending goals, stop the active one, and reject new ones. Return the effects."""
+        """End all pending and interrupted goals, stop the active one, and reject new ones. Return the effects."""
         self.closing = True
         effects: list[Effect] = []
         for record in list(self.pending):
             effects += self._recall(record, Reason.SHUTDOWN, "the server was stopped", None, now)
-        if self.active:
-            effects += self._stop(self.active, Reason.SHUTDOWN, None, now)
+        for record in self.begun():
+            effects += self._stop(record, Reason.SHUTDOWN, None, now)
         return effects
 
     # -- reports from the engine
@@ -518,6 +567,7 @@ class Scheduler:
             opening = [] if between[-1:].isspace() else between.split()[-1:]  # such as a quotation mark
             record.spoken_end = record.begun_end + len(between.removesuffix("".join(opening)).rstrip())
         record.begun_end = max(record.begun_end, end)
+        record.word_count += 1
         record.passed_chars = max(record.passed_chars, end)
         self.audio_heard(goal_id, seconds)
 
@@ -549,9 +599,31 @@ class Scheduler:
     def output_changed(self, goal_id: str, output: Output | None) -> None:
         """Record the audio output of the active goal.
 
-        `output` is None if it is unknown.
+        `output` is None if it is unknown. A goal that was ever muted counts as muted.
         """
-        self._require_active(goal_id).output = output
+        record = self._require_active(goal_id)
+        if record.output and record.output.muted:
+            output = replace(output or record.output, muted=True)
+        record.output = output
+
+    def interrupted_at(self, goal_id: str, rest: int, now: Now, gaps: int = 0, gap_seconds: float = 0) -> list[Effect]:
+        """Record that the active goal was interrupted, and start the next goal. Return the effects.
+
+        Args:
+            goal_id: the id of the goal.
+            rest: the offset in the text at which the goal will continue.
+            now: the current time.
+            gaps: how often the audio was interrupted because the synthesis was too slow.
+            gap_seconds: the total length of these gaps.
+        """
+        record = self._require_active(goal_id)
+        if record.state is State.PREEMPTING:
+            return self.stopped(goal_id, now)
+        record.rest, record.paused, record.waits, record.stalls_at = rest, True, False, inf
+        record.gaps, record.gap_seconds = record.gaps + gaps, record.gap_seconds + gap_seconds
+        self.interrupted.append(record)
+        interrupter, self._interrupter, self.active = self._interrupter, None, None
+        return _set_interrupter(record, interrupter) + self._start_next(now)
 
     def completed(
         self, goal_id: str, duration: float | None, now: Now, gaps: int = 0, gap_seconds: float = 0
@@ -569,6 +641,7 @@ class Scheduler:
         """
         record = self._require_active(goal_id)
         record.duration = duration
+        gaps, gap_seconds = record.gaps + gaps, record.gap_seconds + gap_seconds
         if record.broken:
             record.spoken_end = record.begun_end
             return self._end(record, State.ABORTED, Reason.BROKEN_OFF, f"speech failed: {_BROKEN_OFF}", None, now)
@@ -593,6 +666,8 @@ class Scheduler:
             return self.stopped(goal_id, now)
         if record.broken and reason is Reason.NOTHING_TO_SAY:  # no sentence was complete
             return self.completed(goal_id, duration, now)
+        if record.rest and reason is Reason.NOTHING_TO_SAY:  # all of the text was heard before the interruption
+            return self.completed(goal_id, record.heard, now)
         return self._end(record, State.ABORTED, reason, f"speech failed: {message}", record.by, now)
 
     def stopped(self, goal_id: str, now: Now) -> list[Effect]:
@@ -600,7 +675,10 @@ class Scheduler:
 
         The engine has confirmed that the goal is silent.
         """
-        record = self._require_active(goal_id)
+        return self._end_stopped(self._require_active(goal_id), now)
+
+    def _end_stopped(self, record: Record, now: Now) -> list[Effect]:
+        """End a goal that was stopped and is silent. Return the effects."""
         if record.reason in {Reason.BROKEN_OFF, Reason.TEXT_STALLED}:
             stalled = f"no more text arrived for {options.format_number(record.say.stall)} s"
             words = f"speech failed: {stalled if record.reason is Reason.TEXT_STALLED else _BROKEN_OFF}"
@@ -672,7 +750,8 @@ class Scheduler:
                 effects += self._end(record, State.ABORTED, Reason.NOT_SILENT, words, record.by, now)
         for each in [each for each, ends_at in self._orphans.items() if now.monotonic >= ends_at]:
             effects += self.break_off(each, now)
-        return effects + self._expire(now) + self._start_next(now) + self._order_next_voice(now)
+        effects += self._expire(now) + self._start_next(now) + self._interrupt_active()
+        return effects + self._order_next_voice(now)
 
     # -- selecting and accepting goals
 
@@ -687,8 +766,9 @@ class Scheduler:
                 chosen.append(record)
             elif goal_id not in waiting_ids:
                 result.unknown.append(goal_id)
-        if self.active and (selection.current or self.active.say.key == selection.key is not None):
+        if self.active and selection.current:
             chosen.append(self.active)
+        chosen += [each for each in self.begun() if each.say.key == selection.key is not None]
         if pending := self.pending.with_key(selection.key):
             chosen.append(pending)
         if selection.before is not None:
@@ -698,7 +778,7 @@ class Scheduler:
             else:
                 result.unknown.append(selection.before)
         unique = {each.number: each for each in chosen}.values()
-        # Cancel the active goal last. Otherwise, another selected goal could start before it is recalled.
+        # Cancel the active goal last. Otherwise, another selected goal could start before it is cancelled.
         return sorted(unique, key=lambda each: (each is self.active, each.number))
 
     def _find_refusal(self, say: Say, server_refusal: Refusal | None, conflicting: Record | None) -> Refusal | None:
@@ -722,10 +802,14 @@ class Scheduler:
         """Return a refusal if a goal repeats another too soon. Store the other goal's id in `record.by`."""
         if say.throttle is None:
             return None
-        active = self.active
         waiting = self.pending.with_content(say.content) if say.key is None else None
-        if active and (active.say.content == say.content if say.key is None else active.say.key == say.key):
-            first, words = active.id, "is being spoken"
+        begun = (
+            each
+            for each in self.begun()
+            if (each.say.content == say.content if say.key is None else each.say.key == say.key)
+        )
+        if spoken := next(begun, None):
+            first, words = spoken.id, "is being spoken"
         elif waiting:
             first, words = waiting.id, "is already waiting"
         else:
@@ -738,11 +822,12 @@ class Scheduler:
         return Reason.THROTTLED, f"{what} {words}"
 
     def _may_preempt(self, say: Say) -> bool:
-        """Return whether a goal may interrupt others.
+        """Return whether a goal may end others.
 
         The goal's options take precedence over the server's setting.
         """
-        return say.flush or bool(self.settings.preempt if say.preempt is None else say.preempt)
+        preempt = self.settings.preempt and not say.interject if say.preempt is None else say.preempt
+        return say.flush or bool(preempt)
 
     def _find_room(self, say: Say) -> list[tuple[Record, Reason]] | None:
         """Return the goals that a new goal removes from the queue, or None if there is no room for it.
@@ -764,7 +849,7 @@ class Scheduler:
         return [(last, Reason.DISPLACED)] if last and last.say.priority <= limit else None
 
     def _enqueue(self, record: Record, to_recall: list[tuple[Record, Reason]], now: Now) -> list[Effect]:
-        """Add a goal to the queue, recall other goals, and stop the active goal if it is preempted.
+        """Add a goal to the queue, recall other goals, and stop the active and interrupted goals if it preempts them.
 
         Return the effects.
         """
@@ -772,11 +857,13 @@ class Scheduler:
         effects: list[Effect] = []
         replaced = None
         for each, reason in to_recall:
-            if reason is Reason.REPLACED and each.say.priority == record.say.priority and not record.preempt:
+            same_kind = (each.say.priority, each.say.interject) == (record.say.priority, record.say.interject)
+            if reason is Reason.REPLACED and same_kind and not record.preempt:
                 replaced = each
             effects += self._recall(each, reason, f"it was {reason} by goal {record.id}", by, now)
-        if record.preempt and self.active and self.active.say.priority <= record.say.priority:
-            effects += self._stop(self.active, Reason.PREEMPTED, by, now)
+        for each in self.begun() if record.preempt else ():
+            if each.say.priority <= record.say.priority:
+                effects += self._stop(each, Reason.PREEMPTED, by, now)
         self.pending.add(record, replaced)
         return effects
 
@@ -793,7 +880,8 @@ class Scheduler:
         If the active goal already has a voice, it needs no other, because the engine keeps that voice until the goal
         ends.
         """
-        voices = (options.without_speaker(self.wanted_voice(each)) for each in self.unfinished() if each.voice is None)
+        needing = (each for each in self.unfinished() if each is not self.active or each.voice is None)
+        voices = (options.without_speaker(self.wanted_voice(each)) for each in needing)
         return list(filter(options.is_neural, dict.fromkeys(voices)))
 
     def _order_next_voice(self, now: Now) -> list[Effect]:
@@ -845,7 +933,7 @@ class Scheduler:
 
     def _next_attempt_time(self) -> float:
         """Return the monotonic time of the next attempt to start a goal."""
-        record = None if self.active or self.paused or not self.has_engine else self.pending.first()
+        record = None if self.active or self.paused or not self.has_engine else self.next_goal()
         if record is None:
             return inf
         return 0.0 if record.next_since == inf else self._start_time(record)
@@ -853,7 +941,34 @@ class Scheduler:
     def _start_time(self, record: Record) -> float:
         """Return the earliest monotonic time at which a goal may start instead of waiting for its voice."""
         waits = self._loads_voices and not record.say.is_sound
-        return self.voices.patience_end(record, self.settings.voice) if waits else 0.0
+        return self.voices.patience_end(record, self.wanted_voice(record)) if waits else 0.0
+
+    def _find_interjection(self, priority: int) -> Record | None:
+        """Return the first waiting interjection with at least this priority, if any. Its voice must be usable now."""
+        return next(
+            (
+                each
+                for each in self.pending.interjections()
+                if each.say.priority >= priority and self._start_time(each) < inf
+            ),
+            None,
+        )
+
+    def _interrupt_active(self) -> list[Effect]:
+        """Interrupt the active goal if an interjection is waiting for that. Return the order, if any.
+
+        Another interjection is only interrupted by one with a higher priority. Sounds are never interrupted.
+        """
+        active = self.active
+        if active is None or active.state is not State.ACTIVE or self.paused or self._interrupter is not None:
+            return []
+        if not self._can_interrupt or active.say.is_sound or len(self.interrupted) >= MAX_INTERRUPTED:
+            return []
+        interjection = self._find_interjection(active.say.priority + active.say.interject)
+        if interjection is None:
+            return []
+        self._interrupter = interjection.id
+        return [EngineOrder(active, Order.INTERRUPT)]
 
     def _start_next(self, now: Now) -> list[Effect]:
         """Start the next goal if possible. Return the effects.
@@ -866,23 +981,31 @@ class Scheduler:
         return [*effects, EngineOrder(record, Order.START)] if record else effects
 
     def _activate_next(self, now: Now) -> tuple[Record | None, list[Effect]]:
-        """Make the next goal ACTIVE if possible. Return this goal, if any, and the effects.
+        """Make the next goal ACTIVE, or continue the last interrupted one, if possible.
+
+        Return this goal, if any, and the effects.
 
         Return None instead of a goal if no goal can start. The effects don't contain the order to speak the goal.
         """
         if self.active or self.paused:
             return None, []
         effects = self._expire(now)
-        record = self.pending.first()
+        record = self.next_goal()
         if record is None:
             return None, effects
         record.next_since = min(record.next_since, now.monotonic)
         if self._start_time(record) > now.monotonic:
             return None, effects
+        self.active, last = record, self.interrupted[-1] if self.interrupted else None
+        if record is last:
+            self.interrupted.pop()
+            record.paused, record.interrupted_by = False, None
+            return record, [*effects, StateChange(record, State.ACTIVE)]
+        if last:
+            effects += _set_interrupter(last, record.id)
         record.change_state(State.ACTIVE)
         self.pending.remove(record)
-        record.started_at, record.began_at = now.wall, now.monotonic
-        self.active = record
+        record.started_at, record.began_at, record.settings = now.wall, now.monotonic, self.settings
         return record, [*effects, StateChange(record, State.ACTIVE)]
 
     def _recall(self, record: Record, reason: Reason, details: str, by: By | None, now: Now) -> list[Effect]:
@@ -896,16 +1019,23 @@ class Scheduler:
         return self._end(record, State.RECALLED, reason, f"not spoken: {details}", by, now)
 
     def _stop(self, record: Record, reason: Reason, by: By | None, now: Now) -> list[Effect]:
-        """Mark the active goal as being stopped. Return the effects that stop it.
+        """Mark the active goal as being stopped, or end an interrupted goal at once. Return the effects.
 
         Return no effects if it is already being stopped.
         """
         if record.state is State.PREEMPTING:
             return []  # keep the reason for the first stop
         record.change_state(State.PREEMPTING)
-        record.reason, record.by, record.stop_requested_at = reason, by, now.monotonic
-        record.paused = False
-        return [StateChange(record, State.PREEMPTING), EngineOrder(record, Order.STOP)]
+        record.reason, record.by, record.paused = reason, by, False
+        effects: list[Effect] = [StateChange(record, State.PREEMPTING)]
+        if record is not self.active:
+            place = self.interrupted.index(record)
+            if place > 0:
+                effects += _set_interrupter(self.interrupted[place - 1], record.interrupted_by)
+            del self.interrupted[place]
+            return effects + self._end_stopped(record, now)
+        record.stop_requested_at = now.monotonic
+        return [*effects, EngineOrder(record, Order.STOP)]
 
     def _reset_stall_limit(self, record: Record, now: Now) -> None:
         """Restart the time limit for more text if a goal waits for text. Otherwise, remove the limit."""
@@ -924,6 +1054,7 @@ class Scheduler:
         record.change_state(state)
         record.reason, record.message, record.by = reason, message, by
         record.ended_at, record.paused, record.more, record.waits = now.wall, False, False, False
+        record.interrupted_by = None
         self._orphans.pop(record, None)
         if record.was_heard and state is not State.ABORTED:
             self._speech_times.add(record)
@@ -931,10 +1062,18 @@ class Scheduler:
         self.recent.add(record)
         if record is not self.active:
             return [StateChange(record, state)]
-        self.active = None
+        self.active = self._interrupter = None
         return [StateChange(record, state), *self._start_next(now), *self._order_next_voice(now)]
 
 
 def _expiry_message(record: Record) -> str:
     """Return the message for a goal whose time to live is over."""
     return f"its ttl of {options.format_number(record.say.ttl)} s was over"
+
+
+def _set_interrupter(record: Record, goal_id: str | None) -> list[Effect]:
+    """Store which goal interrupts another one. Return the effects."""
+    if goal_id is None or record.interrupted_by == goal_id:
+        return []
+    record.interrupted_by = goal_id
+    return [Interruption(record, goal_id)]

@@ -134,7 +134,7 @@ class VoiceScheduler:
         if found and found.state is VoiceState.FAILED and voice != self._loading:
             del self._voices[voice]
 
-    def patience_end(self, record: Record, default_voice: str | None) -> float:
+    def patience_end(self, record: Record, voice: str) -> float:
         """Return when the next goal stops waiting for its voice (monotonic), or 0 if it doesn't wait.
 
         Urgent goals don't wait. Other goals stop waiting before they expire. A `voice_only` goal waits until its voice
@@ -142,14 +142,14 @@ class VoiceScheduler:
 
         Args:
             record: the next goal.
-            default_voice: the voice of goals that don't name one.
+            voice: the voice with which it is to be spoken.
         """
-        found = self._voices.get(without_speaker(record.say.voice or default_voice)) if self._voices else None
+        found = self._voices.get(without_speaker(voice)) if self._voices else None
         if found is None or found.state not in {VoiceState.WAITING, VoiceState.LOADING}:
             return 0.0
         if record.say.voice_only:
             return inf
-        if record.preempt or record.say.priority > 0:
+        if record.preempt or record.say.interject or record.say.priority > 0:
             return 0.0
         start = (found.loading_since if found.loading_since < inf else record.next_since) + VOICE_PATIENCE_S
         return min(start, record.expires_at - EXPIRY_MARGIN_S)

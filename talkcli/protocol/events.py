@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 
 PROTOCOL = 1
+#: The lists of goals in a server's status, in the order of the fields of `ServerStatus`.
+_STATUS_LISTS = ("pending", "recent", "interrupted")
 
 
 @frozen
@@ -36,12 +38,15 @@ class ServerStatus:
     pending: tuple[Goal, ...]
     #: the most recently ended goals, oldest first
     recent: tuple[Goal, ...]
+    #: the interrupted goals, in the order in which they will continue
+    interrupted: tuple[Goal, ...] = ()
 
     def to_json(self) -> JsonObject:
         """Return the status as a JSON object for clients."""
         return {
             "server": self.server,
             "active": None if self.active is None else self.active.to_json(),
+            "interrupted": [each.to_json() for each in self.interrupted],
             "pending": [each.to_json() for each in self.pending],
             "recent": [each.to_json() for each in self.recent],
         }
@@ -52,24 +57,20 @@ class ServerStatus:
 
         Raises Unreadable if one of the goals is malformed.
         """
-        server, pending, recent = message.get("server"), message.get("pending"), message.get("recent")
-        return cls(
-            server if isinstance(server, dict) else {},
-            goal_in(message, "active"),
-            tuple(map(Goal.from_json, pending)) if isinstance(pending, list) else (),
-            tuple(map(Goal.from_json, recent)) if isinstance(recent, list) else (),
-        )
+        server, lists = message.get("server"), [message.get(name) for name in _STATUS_LISTS]
+        goals = [tuple(map(Goal.from_json, each)) if isinstance(each, list) else () for each in lists]
+        return cls(server if isinstance(server, dict) else {}, goal_in(message, "active"), *goals)
 
     @classmethod
     def from_reply(cls, reply: JsonObject, items: list[JsonObject]) -> ServerStatus:
         """Read a status from a reply and the list items before it."""
-        lists = {name: [each[name] for each in items if name in each] for name in ("pending", "recent")}
+        lists = {name: [each[name] for each in items if name in each] for name in _STATUS_LISTS}
         return cls.from_json({**reply, **lists})
 
 
 def unfinished(status: ServerStatus) -> list[Goal]:
-    """Return the active goal, followed by the pending goals in their order."""
-    return [*([status.active] if status.active else []), *status.pending]
+    """Return the active goal, followed by the interrupted and the pending goals in their order."""
+    return [*([status.active] if status.active else []), *status.interrupted, *status.pending]
 
 
 @frozen
@@ -160,6 +161,21 @@ class TextMissing:
 
 
 @frozen
+class Interrupted:
+    """Event sent when another goal interrupts a goal. When the goal continues, it is reported as ACTIVE again."""
+
+    id: str
+    #: the goal that interrupts this one
+    by: By
+    at: float | None = None
+    n: int | None = None
+
+    def to_json(self) -> JsonObject:
+        """Return the event's JSON object."""
+        return {**_event_json("interrupted", self), "by": self.by.to_json()}
+
+
+@frozen
 class PausedChanged:
     """An event that is sent when all speech is paused or resumed."""
 
@@ -198,7 +214,7 @@ class Snapshot:
         return {"event": "snapshot", **self.status.to_json()}
 
 
-Event = StateChanged | WordHeard | TextAdded | TextMissing | PausedChanged | Result | Snapshot
+Event = StateChanged | WordHeard | TextAdded | TextMissing | Interrupted | PausedChanged | Result | Snapshot
 
 #: Event classes by kind. Snapshot is missing, because its fields differ from those of its message.
 _EVENTS_BY_KIND: dict[str, type[Event]] = {
@@ -206,6 +222,7 @@ _EVENTS_BY_KIND: dict[str, type[Event]] = {
     "word": WordHeard,
     "text": TextAdded,
     "waits": TextMissing,
+    "interrupted": Interrupted,
     "paused": PausedChanged,
     "result": Result,
 }
@@ -233,7 +250,9 @@ def from_json(message: JsonObject) -> Event | None:
     return event(**found)
 
 
-def _event_json(kind: str, event: StateChanged | WordHeard | TextAdded | TextMissing | PausedChanged) -> JsonObject:
+def _event_json(
+    kind: str, event: StateChanged | WordHeard | TextAdded | TextMissing | Interrupted | PausedChanged
+) -> JsonObject:
     """Return the JSON object of an event, without its goal.
 
     The caller converts enums and objects.

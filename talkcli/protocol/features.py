@@ -24,6 +24,7 @@ FEATURES: dict[str, tuple[str, str, object]] = {
     "sound": ("sounds", "format", "sound"),
     "sounds": ("lists of sounds", "request", "sounds"),
     "timed_pauses": ("pauses that end", "seconds", None),
+    "interject": ("interjections", "interject", True),
 }
 
 

@@ -328,12 +328,11 @@ class Requests:
         for record in records:
             if not record.state.terminal:
                 self._speech.subscribers.subscribe_to_goal(record.id, pending.connection, feedback=request.feedback)
-        # The list shows the goals as they are now, and events report later changes. Only the active goal may look
-        # different later, so its snapshot is made now. The other snapshots are made when they are sent.
-        active = self._scheduler.active
-        spoken = active.snapshot() if active else None
+        # The list shows the goals as they are now, and events report later changes. Only goals that have begun may look
+        # different later, so their snapshots are made now. The other snapshots are made when they are sent.
+        begun = {each: each.snapshot() for each in self._scheduler.begun()}
         states = [(record, record.state) for record in records]
-        goals = (spoken if spoken and record is active else record.snapshot(state) for record, state in states)
+        goals = (begun.get(record) or record.snapshot(state) for record, state in states)
         results = (Result(record.snapshot()).to_json() for record, state in states if state.terminal)
         pending.answer(({"goal": each.to_json()} for each in goals), results, count=len(records))
 
@@ -352,7 +351,7 @@ class Requests:
                 await pending.wait(speech.waiting_for_silence[result.stopping])
         else:
             await speech.notifications.wait_done(pending)
-        ended = result.recalled + [each.canceled_goal for each in waiting if each.canceled_goal]
+        ended = result.ended_at_once + [each.canceled_goal for each in waiting if each.canceled_goal]
         if result.stopping and result.stopping.state is not State.SUCCEEDED:
             ended.append(result.stopping)
         goals = chain(_goal_items("canceled", ended), _goal_items("ended", result.ended))
@@ -419,7 +418,11 @@ class Requests:
         recent = self._scheduler.recent.latest(RECENT_GOALS, include_rejected=False)
         active = self._scheduler.active
         now = active.snapshot().to_json() if active else None
-        goals = chain(_goal_items("pending", list(self._scheduler.pending)), _goal_items("recent", recent))
+        goals = chain(
+            _goal_items("interrupted", self._scheduler.interrupted[::-1]),
+            _goal_items("pending", list(self._scheduler.pending)),
+            _goal_items("recent", recent),
+        )
         pending.answer(goals, server=self._describe(), active=now)
 
     async def _voices(self, pending: PendingRequest, _: Voices) -> None:

@@ -16,7 +16,7 @@ from talkcli.daemon import log
 from talkcli.daemon.systemd import ServiceManager
 from talkcli.engine import protocol
 from talkcli.engine.parent.supervisor import Supervisor
-from talkcli.engine.players import is_silent
+from talkcli.engine.players import FILE_PREFIX, is_silent
 from talkcli.engine.pronunciation import PronunciationFile
 from talkcli.engine.protocol import START_LIMIT_S
 from talkcli.engine.sounds import SoundLibrary
@@ -116,6 +116,7 @@ class Server:
             max_text=settings.max_text,
             settings=settings.goals,
             voices=VoiceScheduler(settings.voice_memory * 1_000_000, VoiceCatalog.file_size),
+            can_interrupt=not (settings.player or "").startswith(FILE_PREFIX),
         )
         self.speech = Speech(self._scheduler, settings.player_options)
         self.speech.on_failure = self._begin_shutdown

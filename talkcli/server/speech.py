@@ -36,7 +36,7 @@ from talkcli.goals.options import (
     without_speaker,
 )
 from talkcli.goals.reasons import Reason
-from talkcli.goals.scheduler import Effect, EngineOrder, Now, Order, PauseChange, StateChange
+from talkcli.goals.scheduler import Effect, EngineOrder, Interruption, Now, Order, PauseChange, StateChange
 from talkcli.goals.states import State
 from talkcli.goals.voices import VoiceDropOrder, VoiceLoadOrder, VoiceWarning
 from talkcli.server.connection import resume_all
@@ -194,6 +194,9 @@ class Speech:
                 changes.append(partial(self._publish_change, effect.record, effect.state, at))
                 queue_changed = queue_changed or effect.state is not State.REJECTED
                 continue
+            if isinstance(effect, Interruption):
+                changes.append(partial(self.subscribers.interrupted, effect.record.id, effect.interrupted_by, at))
+                continue
             if isinstance(effect, PauseChange):
                 changes.append(partial(self._publish_pause, effect, at))
                 resumed = None if effect.paused else effect.record
@@ -237,6 +240,8 @@ class Speech:
                 self.engine.append(record.id, record.say.text, complete=not record.more, broke_off=record.broken)
             case Order.STOP:
                 self.engine.stop(record.id)
+            case Order.INTERRUPT:
+                self.engine.interrupt(record.id)
             case Order.GIVE_UP:
                 self.engine.give_up(record.id)
             case Order.HOLD:
@@ -245,9 +250,15 @@ class Speech:
                 self.engine.resume(record.id)
 
     def _start_speaking(self, record: Record) -> None:
-        """Tell the engine to speak a goal. If the goal's voice is unavailable, fail the goal."""
+        """Tell the engine to speak a goal, or the rest of an interrupted one. If its voice is unavailable, fail it.
+
+        The rest has the same voice and settings.
+        """
         self._announced_next = next_waits, next_is_neural = self._describe_next()
-        options = engine_options(record.say, self.scheduler.settings)
+        assert record.settings
+        options = engine_options(record.say, record.settings)
+        if record.begun_end:
+            options |= {"voice": record.voice or options["voice"], "lead_in": None}
         if not is_neural(options["voice"] or ""):
             options["voice_only"] = False
         elif options["voice_only"]:
@@ -264,6 +275,11 @@ class Speech:
             next_is_neural=next_is_neural,
             more=record.more,
             pronunciations=dict(record.pronunciations or {}) or None,
+            broken=record.broken,
+            start=record.rest,
+            heard_end=record.begun_end,
+            heard_words=record.word_count,
+            heard=record.heard,
             **options,
         )
         self.engine.speak(command)
@@ -294,7 +310,7 @@ class Speech:
 
     def _describe_next(self) -> tuple[bool, bool]:
         """Return whether there is a next goal, and whether its voice is neural."""
-        following = self.scheduler.pending.first()
+        following = self.scheduler.next_goal()
         return following is not None, following is not None and is_neural(self.scheduler.wanted_voice(following))
 
     def _publish_change(self, record: Record, state: State, at: float) -> None:
@@ -469,6 +485,13 @@ class Speech:
             scheduler.audio_heard(ended.id, ended.heard)
         if ended.outcome == protocol.OUTCOME_COMPLETED:
             effects = scheduler.completed(ended.id, ended.duration, now, ended.gaps, ended.gap_seconds)
+        elif ended.outcome == protocol.OUTCOME_INTERRUPTED:
+            if active.waits:
+                publish = partial(self.subscribers.text_missing, active.id, time.time(), waits=False)
+                self.notifications.add([publish])
+            rest = ended.rest or 0
+            effects = scheduler.interrupted_at(ended.id, rest, now, ended.gaps, ended.gap_seconds)
+            resume_all(self.waiting_for_silence[active])
         elif ended.outcome == protocol.OUTCOME_STOPPED and active.stop_requested_at is not None:
             effects = scheduler.stopped(ended.id, now)
         else:

@@ -12,15 +12,16 @@ from typing import TYPE_CHECKING
 
 from talkcli.daemon import log
 from talkcli.frozen import replace
+from talkcli.goals.goal import By
 from talkcli.goals.states import State
-from talkcli.protocol.events import PausedChanged, Result, StateChanged, TextAdded, TextMissing, WordHeard
+from talkcli.protocol.events import Interrupted, PausedChanged, Result, StateChanged, TextAdded, TextMissing, WordHeard
 from talkcli.protocol.lines import encode
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from talkcli.engine.protocol import Word
-    from talkcli.goals.goal import By, JsonObject
+    from talkcli.goals.goal import JsonObject
     from talkcli.goals.record import Record
     from talkcli.server.connection import ClientConnection, PendingRequest
     from talkcli.server.stream import ClientStreams
@@ -118,6 +119,11 @@ class Subscribers:
     def text_missing(self, goal_id: str, at: float, *, waits: bool) -> None:
         """Tell clients that want feedback whether a goal waits for text."""
         event = TextMissing(goal_id, waits, at, next(self._numbers))
+        _publish(event.to_json(), self._feedback_receivers([self._waiters.get(goal_id, {})]))
+
+    def interrupted(self, goal_id: str, interrupted_by: str, at: float) -> None:
+        """Tell clients that want feedback which goal interrupts another one."""
+        event = Interrupted(goal_id, By(goal=interrupted_by), at, next(self._numbers))
         _publish(event.to_json(), self._feedback_receivers([self._waiters.get(goal_id, {})]))
 
     def paused_changed(self, goal_id: str | None, *, paused: bool, by: By, at: float) -> None:

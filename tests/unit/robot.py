@@ -7,6 +7,7 @@ Every other step is a verb:
     a more stall=2; append a text=door at=4 end broken; left a    send a growing text, add to it, and leave
     starved a; fed a            report as the engine that text is missing, or that it is no longer missing
     heard a; completed a; failed a; stopped a; deaf a   report this as the engine; * is the active goal
+    interrupted a 2             report that the goal was interrupted, and continues at this place in its text (1)
     cancel; cancel a b; cancel current before=c key=k
     wait 1; pass 1              let a second pass, with or without a tick
     pause; pause seconds=5; pause connection=x; gone x (the connection x ends); resume
@@ -28,7 +29,15 @@ import pytest
 from talkcli.goals.goal import By, Sender
 from talkcli.goals.options import DEFAULTS, Append, Cancel, Say
 from talkcli.goals.reasons import Reason
-from talkcli.goals.scheduler import Cancellation, Effect, EngineOrder, Now, Scheduler, StateChange
+from talkcli.goals.scheduler import (
+    Cancellation,
+    Effect,
+    EngineOrder,
+    Interruption,
+    Now,
+    Scheduler,
+    StateChange,
+)
 from talkcli.goals.voices import VoiceDropOrder, VoiceLoadOrder, VoiceScheduler
 
 if TYPE_CHECKING:
@@ -68,6 +77,8 @@ class Robot:
                 self.seen.append(f"{self.name_of(effect.record)} {effect.state.name}")
             elif isinstance(effect, EngineOrder):
                 self.seen.append(f"{self.name_of(effect.record)} {effect.order.value}")
+            elif isinstance(effect, Interruption):
+                self.seen.append(f"{self.name_of(effect.record)} interrupted by {effect.interrupted_by}")
             elif isinstance(effect, VoiceLoadOrder):
                 self.seen += [*(f"drop {voice}" for voice in effect.dropped), f"load {effect.voice}"]
             elif isinstance(effect, VoiceDropOrder):
@@ -129,6 +140,8 @@ class Robot:
                 self.collect(self.scheduler.failed(goal_id, Reason.NOT_SILENT, "it does not end", None, self.now))
             case "stopped":
                 self.collect(self.scheduler.stopped(goal_id, self.now))
+            case "interrupted":
+                self.collect(self.scheduler.interrupted_at(goal_id, 1, self.now))
             case "starved" | "fed":
                 self.scheduler.text_missing(goal_id, 1, self.now, missing=event == "starved")
             case _:
@@ -206,6 +219,9 @@ class Robot:
         assert (goal.ended_at is not None) == goal.state.terminal
         assert (goal.message is not None) == goal.state.terminal
         parts = [goal.state.name, *(["paused"] if goal.paused else []), *([goal.reason] if goal.reason else [])]
+        if goal.interrupted_by:
+            names = [name for name, other in self.goals.items() if other.id == goal.interrupted_by]
+            parts += ["for", *names]
         if goal.by and goal.by.goal:
             parts += ["by", self.name_of(next(other for other in self.goals.values() if other.id == goal.by.goal))]
         elif goal.by and goal.by.client:

@@ -16,8 +16,8 @@ from tests.unit.test_lines import values
 #: All keys of a goal. Unknown values are null.
 KEYS = [
     "id", "state", "status", "reason", "by", "message", "text", "format", "said", "spoken", "spoken_end",
-    "heard", "priority", "key", "ttl", "data", "client", "paused", "more", "waits", "queued_at", "started_at",
-    "ended_at", "duration", "voice", "output",
+    "heard", "priority", "key", "ttl", "data", "client", "paused", "interrupted_by", "more", "waits",
+    "queued_at", "started_at", "ended_at", "duration", "voice", "output",
 ]  # fmt: skip
 
 numbers = st.integers(-(10**18), 10**18)

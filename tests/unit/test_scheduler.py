@@ -216,7 +216,7 @@ def test_a_cancel_returns_ended_and_unknown_goals() -> None:
     robot = play("a; completed a; b; c; d")
     a, b, c, _ = robot.goals.values()
     done = robot.cancel(a.id, "4k7f-99", c.id, c.id, current=True, before="mine")
-    assert (done.ended, done.unknown, done.recalled, done.stopping) == ([a], ["4k7f-99", "mine"], [c], b)
+    assert (done.ended, done.unknown, done.ended_at_once, done.stopping) == ([a], ["4k7f-99", "mine"], [c], b)
     assert len(done.effects) == 3
     assert (c.by, b.by) == (By(client=DOOR), By(client=DOOR))
     again = robot.cancel(b.id)
@@ -228,7 +228,7 @@ def test_a_cancel_knows_the_ids_of_goals_that_wait_for_room() -> None:
     robot = play("a; b")
     assert robot.cancel("mine", waiting=("mine",)) == Cancellation()
     done = robot.cancel(before="mine", waiting=("mine",))
-    assert (done.unknown, done.recalled, done.stopping) == ([], [robot.goals["b"]], robot.goals["a"])
+    assert (done.unknown, done.ended_at_once, done.stopping) == ([], [robot.goals["b"]], robot.goals["a"])
     assert robot.play("c id=mine").goals["c"].state is State.PENDING
 
 

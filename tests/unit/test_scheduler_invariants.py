@@ -16,7 +16,15 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from talkcli.errors import RequestRefused
-from talkcli.goals.scheduler import CONFIRM_SILENCE_S, EngineOrder, Now, Order, StateChange
+from talkcli.goals.scheduler import (
+    CONFIRM_SILENCE_S,
+    MAX_INTERRUPTED,
+    EngineOrder,
+    Interruption,
+    Now,
+    Order,
+    StateChange,
+)
 from talkcli.goals.states import TRANSITIONS, IllegalTransition, State
 from talkcli.goals.voices import VoiceLoadOrder
 from tests.unit.robot import Robot
@@ -30,7 +38,7 @@ if TYPE_CHECKING:
 #: Few values for each option, so that goals collide. Times are multiples of the clock's steps, so that they coincide.
 OPTIONS = [
     ["text=door", "text=battery", "text=é日🤖"],
-    ["", "", "", "preempt", "preempt", "queue", "flush"],
+    ["", "", "", "preempt", "preempt", "queue", "flush", "interject", "interject", "interject"],
     ["", "", "1", "5", "-1"],
     ["", "", "key=battery", "key=door"],
     ["", "", "ttl=0.5", "ttl=0.0", "ttl=3.0"],
@@ -42,7 +50,19 @@ OPTIONS = [
     ["", "", "more", "more stall=2"],
 ]
 IDS = ["mine", "arm.1", "4k7f-900", *(f"4k7f-{number}" for number in range(1, 9))]
-ENGINE = ["heard", "completed", "completed", "failed", "deaf", "stopped", "starved", "starved", "fed"]
+ENGINE = [
+    "interrupted",
+    "interrupted",
+    "heard",
+    "completed",
+    "completed",
+    "failed",
+    "deaf",
+    "stopped",
+    "starved",
+    "starved",
+    "fed",
+]
 STEPS_S = ["0", "0.5", "1", "2", "10"]
 BUSY = {State.ACTIVE, State.PREEMPTING}
 
@@ -65,7 +85,7 @@ def script(seed: int, length: int = 40) -> list[str]:
         *[lambda: f"{pick(['wait', 'wait', 'pass'])} {pick(STEPS_S)}"] * 2,
         *[lambda: pick(["pause", "resume", "resume", "lost", "ready", "ready", "missing"])] * 2,
         lambda: pick(["pause seconds=1", "pause connection=x", "pause connection=y seconds=2", "gone x", "gone y"]),
-        lambda: f"{pick(['heard', 'completed', 'failed', 'stopped'])} {pick(IDS)}",
+        lambda: f"{pick(['heard', 'completed', 'failed', 'stopped', 'interrupted'])} {pick(IDS)}",
         lambda: f"append {pick(IDS)} text={pick('ab')} {pick(['', '', 'end', 'broken'])}",
         lambda: f"left {pick(IDS)}",
         lambda: f"set preempt={pick(['yes', 'no'])} ttl={pick(['0.0', '1.0'])} voice={pick(['en', 'piper/joe'])}",
@@ -88,6 +108,8 @@ class Checked(Robot):
         self.ended: dict[str, Goal] = {}
         self.started: set[str] = set()
         self.busy: set[str] = set()
+        #: the interrupted goals
+        self.silent: set[str] = set()
         #: the state of the engine: its current goal, and its last order for this goal
         self.engine: Record | None = None
         self.orders: list[Order] = []
@@ -112,7 +134,7 @@ class Checked(Robot):
 
     def cancel(self, *ids: str, waiting: tuple[str, ...] = (), **selection: Any) -> Cancellation:
         done = super().cancel(*ids, waiting=waiting, **selection)
-        assert all(record.state is State.RECALLED for record in done.recalled)
+        assert all(record.state in {State.RECALLED, State.PREEMPTED} for record in done.ended_at_once)
         assert done.stopping is None or done.stopping.state is State.PREEMPTING
         if not ids and selection in ({}, {"current": False}):
             assert len(self.scheduler.pending) == 0
@@ -142,6 +164,8 @@ class Checked(Robot):
             return  # no goal is active
         if self.engine and goal_id == self.engine.id:
             stopping = self.engine.state is State.PREEMPTING
+            if event == "interrupted" and Order.INTERRUPT not in self.orders:
+                return
             super().report(event if stopping or event not in {"deaf", "stopped"} else "heard", goal_id)
         else:
             before = self.scheduler.unfinished()
@@ -157,6 +181,8 @@ class Checked(Robot):
                 self._check_state(effect.record, effect.state)
             elif isinstance(effect, EngineOrder):
                 self._check_order(effect.record, effect.order)
+            elif isinstance(effect, Interruption):
+                self._check_interruption(effect.record, effect.interrupted_by)
             elif isinstance(effect, VoiceLoadOrder):
                 assert self.scheduler.has_engine
                 assert effect.voice not in effect.dropped, "the voice to load was dropped"
@@ -169,10 +195,13 @@ class Checked(Robot):
         # RECALLING is not published.
         before = State.RECALLING if state is State.RECALLED else path[-1] if path else None
         allowed = TRANSITIONS[before] if before is not None else {State.PENDING, State.REJECTED}
+        if record.id in self.silent and state is State.ACTIVE:
+            self.silent.remove(record.id)  # the goal continues
+            allowed = {State.ACTIVE}
         assert state in allowed, f"{record.id}: {path}, then {state}"
         assert not (path and path[-1].terminal), f"{record.id} ended twice"
         path.append(state)
-        (self.busy.add if state in BUSY else self.busy.discard)(record.id)
+        (self.busy.add if state in BUSY and record.id not in self.silent else self.busy.discard)(record.id)
         assert len(self.busy) <= 1, "two goals are spoken at once"
         if state.terminal:
             assert record.message
@@ -181,13 +210,22 @@ class Checked(Robot):
             if self.engine is record:
                 self.engine = None
 
+    def _check_interruption(self, record: Record, interrupted_by: str) -> None:
+        assert self.states[record.id][-1] is State.ACTIVE
+        assert self.scheduler.find(interrupted_by)
+        if self.engine is record:
+            assert Order.INTERRUPT in self.orders
+            self.engine = None
+        self.silent.add(record.id)
+        self.busy.discard(record.id)
+
     def _check_order(self, record: Record, order: Order) -> None:
         if order is Order.START:
             assert self.engine is None, "a goal started before the last one had ended"
-            assert record.id not in self.started, "a goal was spoken twice"
+            assert record.id not in self.started or record.rest, "a goal was spoken twice"
             assert self.scheduler.has_engine
             assert not self.scheduler.paused
-            assert self.seconds < record.expires_at, "a goal started too late"
+            assert self.seconds < record.expires_at or record.rest, "a goal started too late"
             self.engine, self.orders = record, []
             self.started.add(record.id)
         elif order is Order.APPEND:
@@ -198,6 +236,11 @@ class Checked(Robot):
             assert self.orders[-1] is Order.STOP
             assert record.stop_requested_at is not None
             assert self.seconds >= record.stop_requested_at + CONFIRM_SILENCE_S
+        elif order is Order.INTERRUPT:
+            assert self.engine is record
+            assert not {Order.INTERRUPT, Order.STOP}.intersection(self.orders), "a goal is interrupted twice"
+            assert self.orders[-1:] != [Order.HOLD], "a goal is interrupted in a pause"
+            self.orders.append(order)
         else:
             assert self.engine is record, "an order for a goal that the engine does not have"
             assert Order.STOP not in self.orders, "an order for a goal that is being stopped"
@@ -210,13 +253,20 @@ class Checked(Robot):
         assert len(scheduler.pending) == len(waiting) <= scheduler.max_queue
         priorities = [goal.say.priority for goal in waiting]
         assert priorities == sorted(priorities, reverse=True)
-        plain = [(-goal.say.priority, goal.number) for goal in waiting if goal.say.key is None and not goal.preempt]
-        assert plain == sorted(plain), "goals of the same priority are not first in, first out"
+        for interject in (True, False):
+            kind = [goal for goal in waiting if goal.say.interject is interject and not goal.preempt]
+            plain = [(-goal.say.priority, goal.number) for goal in kind if goal.say.key is None]
+            assert plain == sorted(plain), "goals of the same priority are not first in, first out"
+        held = scheduler.interrupted
+        assert len(held) <= MAX_INTERRUPTED
+        assert all((each.state, each.paused) == (State.ACTIVE, True) for each in held)
+        assert all(each.interrupted_by in self.records for each in held)
         keys = [record.say.key for record in waiting if record.say.key is not None]
         assert len(keys) == len(set(keys)), "two pending goals have the same key"
         assert all(scheduler.find(record.id) is record for record in scheduler.unfinished())
-        if waiting and not (scheduler.active or scheduler.paused) and scheduler.has_engine:
-            waits_for_voice = scheduler._start_time(waiting[0]) > self.seconds
+        following = scheduler.next_goal()
+        if following and not (scheduler.active or scheduler.paused) and scheduler.has_engine:
+            waits_for_voice = scheduler._start_time(following) > self.seconds
             deadline = scheduler.deadline()
             is_due = deadline <= self.seconds  # the next tick starts the goal
             assert waits_for_voice or is_due, "a goal waits without a reason"
