@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from talkcli.goals.states import State
     from talkcli.protocol.events import (
         Canceled,
+        GoalInterrupted,
         PausedChanged,
         Result,
         ServerStatus,
@@ -35,6 +36,7 @@ __all__ = [
     "Fleet",
     "Goal",
     "GoalHandle",
+    "GoalInterrupted",
     "Outcome",
     "PausedChanged",
     "Presence",

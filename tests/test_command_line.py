@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 GOAL = {
     "id", "state", "status", "reason", "by", "message", "text", "format", "spoken", "spoken_end",
-    "heard", "priority", "key", "ttl", "data", "client", "paused", "more", "waits", "queued_at", "started_at",
-    "ended_at", "duration", "voice", "output",
+    "heard", "priority", "key", "ttl", "data", "client", "paused", "interrupted_by", "more", "waits",
+    "queued_at", "started_at", "ended_at", "duration", "voice", "output",
 }  # fmt: skip
 #: ESC, a bidi override, a line break, a bell, a NEL: none of these may reach a terminal.
 HOSTILE = "a\x1b[31mred\u202egnp.exe\nfake line\x07\x85\u2028end"

@@ -6,6 +6,8 @@ import json
 import signal
 from typing import TYPE_CHECKING, Any
 
+import pytest
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -86,6 +88,28 @@ def test_pause_and_resume_are_shown(scripted: Talk) -> None:
     shown = [line.split()[1] for line in lines]
     assert shown == ["ACTIVE", "word", "PAUSED", "RESUMED", "PREEMPTING", "PREEMPTED"]
     assert client.wait(10) == 143
+
+
+def test_an_interruption_is_shown(scripted: Talk) -> None:
+    client = scripted.start("say", "-wf", "--", "never-ends words=1")
+    lines = lines_of(client)
+    goal_id = next(lines).split()[0]
+    scripted.watcher.wait_for_word(goal_id)
+    aside = scripted.run("say", "-w", "--interject", "length=0").id
+    client.send_signal(signal.SIGTERM)
+    shown = [line.split()[1:] for line in lines if " word " not in line]
+    assert shown == [["ACTIVE"], ["INTERRUPTED", aside], ["ACTIVE"], ["PREEMPTING"], ["PREEMPTED"]]
+    assert client.wait(10) == 143
+
+
+@pytest.mark.parametrize(("options", "noted"), [((), True), (("--quiet",), False)])
+def test_a_command_that_waits_notes_an_interruption(scripted: Talk, options: tuple[str, ...], noted: bool) -> None:
+    client = scripted.start(*options, "say", "-w", "--", "never-ends words=1")
+    goal_id = scripted.watcher.wait_until(lambda event: event["event"] == "word")["id"]
+    aside = scripted.run("say", "-w", "--interject", "length=0").id
+    assert scripted.run("cancel").code == 0
+    note = f"talk: goal {goal_id} was interrupted by goal {aside}, and continues afterwards"
+    assert (scripted.finish(client).err.splitlines()[:1] == [note]) == noted
 
 
 def test_wait_follows_several_goals_in_the_servers_order(scripted: Talk) -> None:

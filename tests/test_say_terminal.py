@@ -114,12 +114,18 @@ def test_the_line_is_redrawn_when_the_terminal_is_resized(scripted: Talk, in_ter
     assert terminal.finish() == 7
 
 
-def test_a_pause_is_shown_and_ctrl_c_leaves_the_terminal_clean(scripted: Talk, in_terminal: Run) -> None:
+def test_a_pause_and_an_interruption_are_shown_and_ctrl_c_leaves_the_terminal_clean(
+    scripted: Talk, in_terminal: Run
+) -> None:
     terminal = in_terminal("say", "-wf", "--", "never-ends words=2 and so on", columns=200)
     terminal.wait_until(lambda screen: screen.marked(LIT) == "words=2")
     scripted.run("pause")
     terminal.wait_until(lambda screen: "  PAUSED     never-ends words=2 and so on" in screen.last)
     scripted.run("resume")
+    terminal.wait_until(lambda screen: "  ACTIVE     never-ends words=2 and so on" in screen.last)
+    aside = scripted.run("say", "--interject", "never-ends").id
+    terminal.wait_until(lambda screen: "  INTERRUPTED  never-ends words=2 and so on" in screen.last)
+    scripted.run("cancel", aside)
     terminal.wait_until(lambda screen: "  ACTIVE     never-ends words=2 and so on" in screen.last)
     terminal.type(b"\x03")
     assert terminal.finish() == 128 + signal.SIGINT

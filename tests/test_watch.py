@@ -99,7 +99,7 @@ def test_words_are_shown_with_feedback(scripted: Talk) -> None:
 def test_json_prints_the_protocols_events(scripted: Talk) -> None:
     watch = Lines(scripted, "--json")
     snapshot = json.loads(watch.lines[0])
-    assert list(snapshot) == ["event", "server", "active", "pending", "recent"]
+    assert list(snapshot) == ["event", "server", "active", "interrupted", "pending", "recent"]
     assert (snapshot["event"], snapshot["active"], snapshot["pending"]) == ("snapshot", None, [])
     goal_id = scripted.run("say", "length=0.1 and more").id
     watch.next("SUCCEEDED")

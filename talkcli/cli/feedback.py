@@ -15,7 +15,7 @@ from talkcli.cli.show import Feedback, has_colour, note, show, show_json, termin
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.states import State
 from talkcli.polling import wait_ready
-from talkcli.protocol.events import PausedChanged, Result, StateChanged, TextMissing, WordHeard
+from talkcli.protocol.events import GoalInterrupted, PausedChanged, Result, StateChanged, TextMissing, WordHeard
 from talkcli.terminal.goals import TEXT_NOT_KEPT
 from talkcli.terminal.text import MeasuredText, Screen, printable, width
 
@@ -74,6 +74,9 @@ class _LineFeedback(Feedback):
             show(f"{printable(event.id)} word {place} {printable(event.word)}")
         elif isinstance(event, TextMissing):
             show(f"{printable(event.id)} {'WAITING' if event.waits else 'CONTINUES'}")
+        elif isinstance(event, GoalInterrupted):
+            self._shown.pop(event.id, None)  # ACTIVE will be shown again when the goal continues
+            show(f"{printable(event.id)} INTERRUPTED {printable(event.by.goal or '')}")
         elif isinstance(event, PausedChanged):
             show(f"{printable(event.id or '-')} {'PAUSED' if event.paused else 'RESUMED'}")
         elif isinstance(event, Result):
@@ -209,6 +212,7 @@ class _GoalLine:
         self.paused = goal.paused
         self.state = State.PENDING if goal.state.terminal else goal.state
         self.waits = goal.waits
+        self.interrupted = goal.interrupted_by is not None
         self.text = MeasuredText(TEXT_NOT_KEPT if goal.text is None else goal.text)
         heard = len(goal.spoken or "")
         #: the start and end of the current word, as indices into the text
@@ -223,9 +227,11 @@ class _GoalLine:
             self.word = (event.start, event.end)
         elif isinstance(event, TextMissing):
             self.waits = event.waits
+        elif isinstance(event, GoalInterrupted):
+            self.interrupted = True
         elif isinstance(event, StateChanged) and event.state is not State.PENDING:
             # A PENDING event may arrive late, when the goal is already in a later state.
-            self.state = event.state
+            self.state, self.interrupted = event.state, False
         self.text.extend(text[len(self.text) :])
 
     def render(self) -> str:
@@ -233,7 +239,9 @@ class _GoalLine:
         # Leave the last column free, because some terminals start a new line as soon as it is filled.
         columns = terminal_columns(sys.stdout) - 1
         state = self.state.name
-        if self.state is State.ACTIVE and (self.paused or self.waits):
+        if self.state is State.ACTIVE and self.interrupted:
+            state = "INTERRUPTED"
+        elif self.state is State.ACTIVE and (self.paused or self.waits):
             state = "PAUSED" if self.paused else "WAITING"
         head = f"{printable(self.goal.id)}  {Screen(colour=True).coloured(f'{state:<9}', self.state)}  "
         if columns - width(head) < _MIN_SENTENCE_COLUMNS:

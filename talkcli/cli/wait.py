@@ -15,7 +15,7 @@ from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import format_number
 from talkcli.goals.states import State
 from talkcli.polling import Interrupted
-from talkcli.protocol.events import Result
+from talkcli.protocol.events import GoalInterrupted, Result
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -83,6 +83,9 @@ class GoalReporter:
         self.feedback.begin([each.goal for each in goals])
         for goal, event in merged(goals, timeout):
             show_if_possible(self.feedback.show, goal.goal, event)
+            if isinstance(event, GoalInterrupted) and not (self._options.quiet or self.feedback.shows_events):
+                words = f"goal {goal.id} was interrupted by goal {event.by.goal}, and continues afterwards"
+                self.feedback.note(words)
 
     def report_refused(self, goal: Goal, prefix: str = "") -> int:
         """Report a goal that wasn't accepted. Return its exit code.

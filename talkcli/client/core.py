@@ -169,7 +169,7 @@ class EventListeners:
             for tracked in self._goals.pop(event.goal.id, set()):
                 tracked._update(event.goal)
             return
-        if isinstance(event, StateChanged | WordHeard | events.TextMissing | events.Interrupted | PausedChanged):
+        if isinstance(event, StateChanged | WordHeard | events.TextMissing | events.GoalInterrupted | PausedChanged):
             for goal_id in self._goals if isinstance(event, PausedChanged) else [event.id]:
                 for tracked in self._goals.get(goal_id, set()):
                     tracked._hear(event)
@@ -256,7 +256,7 @@ class TrackedGoal:
             self.goal = goal
 
     def _hear(
-        self, event: StateChanged | WordHeard | events.TextMissing | events.Interrupted | PausedChanged | Goal
+        self, event: StateChanged | WordHeard | events.TextMissing | events.GoalInterrupted | PausedChanged | Goal
     ) -> None:
         """Update the goal from an event, and buffer the event."""
         if self.goal.state.terminal:
@@ -272,13 +272,14 @@ class TrackedGoal:
                 paused = self.goal.paused and self.goal.interrupted_by is None
                 self.goal = replace(self.goal, state=event.state, paused=paused, interrupted_by=None)
             self._buffer.add(event)
+        elif isinstance(event, events.GoalInterrupted):
+            self.goal = replace(self.goal, paused=True, interrupted_by=event.by.goal)
+            self._buffer.add(event)
         else:
             if isinstance(event, PausedChanged):
                 self.speech_paused = event.paused
                 paused = event.paused and event.id == self.goal.id and self.goal.state is State.ACTIVE
                 self.goal = replace(self.goal, paused=paused or self.goal.interrupted_by is not None)
-            elif isinstance(event, events.Interrupted):
-                self.goal = replace(self.goal, paused=True, interrupted_by=event.by.goal)
             elif isinstance(event, events.TextMissing):
                 self.goal = replace(self.goal, waits=event.waits)
             if self._with_feedback:

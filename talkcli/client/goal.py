@@ -173,9 +173,12 @@ class GoalHandle(GoalCalls):
     def events(self, timeout: float | None = None) -> Iterator[Event]:
         """Iterate over the goal's events as they happen. The last event is the Result.
 
-        There is a StateChanged for each state. If the goal was sent or followed with `feedback`, there is also a
-        WordHeard for each word as it is heard, and a PausedChanged whenever speech is paused or resumed. If the goal
-        can no longer be followed, for example because the server was restarted, the goal ends as LOST.
+        There is a StateChanged for each state. If another goal interrupts this one, there is a GoalInterrupted, and a
+        StateChanged to ACTIVE when this one continues.
+
+        If the goal was sent or followed with `feedback`, there is also a WordHeard for each word as it is heard, and a
+        PausedChanged whenever speech is paused or resumed. If the goal can no longer be followed, for example because
+        the server was restarted, the goal ends as LOST.
 
         Args:
             timeout: seconds in which the goal must end, counted from this call; None for no limit.

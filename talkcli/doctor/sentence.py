@@ -133,7 +133,7 @@ def _cancel_late_goal(client: Client, goal: GoalHandle, limit: float) -> Sentenc
         return SentenceResult(
             ended.state, "late", f"the sentence was cancelled, because it had not ended after {limit:g} s"
         )
-    ahead = pending.index(goal.id) + bool(before.active)
+    ahead = pending.index(goal.id) + bool(before.active) + len(before.interrupted)
     goals = "1 goal" if ahead == 1 else f"{ahead} goals"
     return SentenceResult(ended.state, "late", f"not spoken: it was still waiting behind {goals} after {limit:g} s")
 

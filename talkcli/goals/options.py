@@ -419,7 +419,7 @@ OPTIONS = (
         "interrupt the current goal at the end of a word, unless it has a higher priority. Afterwards, that goal "
         "continues with its next word",
         default=False,
-        help="Interrupt the current sentence at the end of a word. It continues afterwards.",
+        help="Interrupt the current sentence at the end of a word. Afterwards, that sentence continues.",
     ),
     Option(
         "priority",

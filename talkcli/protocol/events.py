@@ -161,7 +161,7 @@ class TextMissing:
 
 
 @frozen
-class Interrupted:
+class GoalInterrupted:
     """Event sent when another goal interrupts a goal. When the goal continues, it is reported as ACTIVE again."""
 
     id: str
@@ -214,7 +214,7 @@ class Snapshot:
         return {"event": "snapshot", **self.status.to_json()}
 
 
-Event = StateChanged | WordHeard | TextAdded | TextMissing | Interrupted | PausedChanged | Result | Snapshot
+Event = StateChanged | WordHeard | TextAdded | TextMissing | GoalInterrupted | PausedChanged | Result | Snapshot
 
 #: Event classes by kind. Snapshot is missing, because its fields differ from those of its message.
 _EVENTS_BY_KIND: dict[str, type[Event]] = {
@@ -222,7 +222,7 @@ _EVENTS_BY_KIND: dict[str, type[Event]] = {
     "word": WordHeard,
     "text": TextAdded,
     "waits": TextMissing,
-    "interrupted": Interrupted,
+    "interrupted": GoalInterrupted,
     "paused": PausedChanged,
     "result": Result,
 }
@@ -251,7 +251,7 @@ def from_json(message: JsonObject) -> Event | None:
 
 
 def _event_json(
-    kind: str, event: StateChanged | WordHeard | TextAdded | TextMissing | Interrupted | PausedChanged
+    kind: str, event: StateChanged | WordHeard | TextAdded | TextMissing | GoalInterrupted | PausedChanged
 ) -> JsonObject:
     """Return the JSON object of an event, without its goal.
 

@@ -20,11 +20,11 @@ FEATURES: dict[str, tuple[str, str, object]] = {
     "append": ("growing texts", "more", True),
     "dry_run": ("dry runs", "dry_run", True),
     "history": ("filters of the log", "history", True),
+    "interject": ("interjections", "interject", True),
     "markdown": ("Markdown", "format", "markdown"),
     "sound": ("sounds", "format", "sound"),
     "sounds": ("lists of sounds", "request", "sounds"),
     "timed_pauses": ("pauses that end", "seconds", None),
-    "interject": ("interjections", "interject", True),
 }
 
 

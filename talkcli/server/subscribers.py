@@ -14,7 +14,15 @@ from talkcli.daemon import log
 from talkcli.frozen import replace
 from talkcli.goals.goal import By
 from talkcli.goals.states import State
-from talkcli.protocol.events import Interrupted, PausedChanged, Result, StateChanged, TextAdded, TextMissing, WordHeard
+from talkcli.protocol.events import (
+    GoalInterrupted,
+    PausedChanged,
+    Result,
+    StateChanged,
+    TextAdded,
+    TextMissing,
+    WordHeard,
+)
 from talkcli.protocol.lines import encode
 
 if TYPE_CHECKING:
@@ -122,9 +130,9 @@ class Subscribers:
         _publish(event.to_json(), self._feedback_receivers([self._waiters.get(goal_id, {})]))
 
     def interrupted(self, goal_id: str, interrupted_by: str, at: float) -> None:
-        """Tell clients that want feedback which goal interrupts another one."""
-        event = Interrupted(goal_id, By(goal=interrupted_by), at, next(self._numbers))
-        _publish(event.to_json(), self._feedback_receivers([self._waiters.get(goal_id, {})]))
+        """Tell all clients that watch or wait for a goal which other goal interrupts it."""
+        event = GoalInterrupted(goal_id, By(goal=interrupted_by), at, next(self._numbers))
+        _publish(event.to_json(), dict.fromkeys(chain(self._watchers, self._waiters.get(goal_id, ()))))
 
     def paused_changed(self, goal_id: str | None, *, paused: bool, by: By, at: float) -> None:
         """Send a pause or resume event to the clients that want feedback.

@@ -91,7 +91,7 @@ def goal_lines(goal: Goal, screen: Screen, now: float) -> list[str]:
     state = screen.coloured(goal.state.name, goal.state)
     rows = [
         ("id", printable(goal.id)),
-        ("state", ", ".join([state, *_silence_reasons(goal)])),
+        ("state", ", ".join([state, *_silence_reasons(goal, screen)])),
         ("reason", goal.reason and printable(goal.reason)),
         ("message", goal.message and printable(goal.message)),
         ("ended", _describe_cause(goal.by) if goal.by else None),
@@ -142,7 +142,10 @@ def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
         words = screen.coloured(describe_pause(server, screen), State.PREEMPTING)
         lines += wrap([f"{words};", "continue with: talk resume"], _pad_label("paused"), screen)
     active = [status.active] if status.active else []
-    tables = (("now", active, "silent"), ("queue", status.pending, "nothing"), ("said", status.recent, "nothing"))
+    tables: list[tuple[str, Sequence[Goal], str]] = [("now", active, "silent")]
+    if status.interrupted:
+        tables.append(("next", status.interrupted, ""))
+    tables += [("queue", status.pending, "nothing"), ("said", status.recent, "nothing")]
     id_width = max((width(screen.goal_id(goal.id)) for _, goals, _ in tables for goal in goals), default=0)
     for label, goals, without in tables:
         lines += _goal_table(label, goals, id_width, screen, now) if goals else [_pad_label(label) + without]
@@ -214,7 +217,7 @@ def _tail_forms(goal: Goal, screen: Screen, now: float) -> list[str]:
     if goal.state.terminal:
         return listed_reason_forms(goal, screen)
     # The sender is the most important detail. If there is no room, the other details are left out, the last one first.
-    senders, details = sender_forms(goal.client, screen), _unfinished_details(goal, now)
+    senders, details = sender_forms(goal.client, screen), _unfinished_details(goal, screen, now)
     kept = range(len(details), -1, -1)
     return [", ".join([f"from {sender}", *details[:count]]) for count in kept for sender in senders]
 
@@ -232,10 +235,12 @@ def _shown_text(goal: Goal) -> str | None:
     return goal.text + ELLIPSIS if goal.text is not None and goal.more and not goal.state.terminal else goal.text
 
 
-def _silence_reasons(goal: Goal) -> list[str]:
+def _silence_reasons(goal: Goal, screen: Screen) -> list[str]:
     """Return the reasons why an unfinished goal is silent now."""
     if goal.state.terminal:
         return []
+    if goal.interrupted_by is not None:
+        return [f"interrupted by {screen.goal_id(goal.interrupted_by)}"]
     return ["paused"] * goal.paused + ["waiting for text"] * goal.waits
 
 
@@ -247,9 +252,9 @@ def _quote(text: str | None, limit: int | None = None) -> str | None:
     return None if text is None else f'"{printable(text, limit)}"'
 
 
-def _unfinished_details(goal: Goal, now: float) -> list[str]:
+def _unfinished_details(goal: Goal, screen: Screen, now: float) -> list[str]:
     """Return details of an unfinished goal, such as its priority and key."""
-    reasons = "".join(f"{each}, " for each in _silence_reasons(goal))
+    reasons = "".join(f"{each}, " for each in _silence_reasons(goal, screen))
     notes = [
         None if goal.started_at is None else f"{reasons}for {max(0.0, now - goal.started_at):.1f} s",
         f"priority {goal.priority}" if goal.priority else None,

@@ -11,7 +11,16 @@ import time
 
 from talkcli.frozen import TYPE_CHECKING, replace
 from talkcli.goals.states import State
-from talkcli.protocol.events import PausedChanged, Snapshot, StateChanged, TextAdded, TextMissing, WordHeard, unfinished
+from talkcli.protocol.events import (
+    GoalInterrupted,
+    PausedChanged,
+    Snapshot,
+    StateChanged,
+    TextAdded,
+    TextMissing,
+    WordHeard,
+    unfinished,
+)
 from talkcli.terminal.goals import clock_time, listed_reason_forms, quoted_text, reason_forms, sender_forms
 from talkcli.terminal.text import (
     COLUMN_GAP,
@@ -101,6 +110,8 @@ class Transcript:
         self._shown_chars: dict[str, int] = {}
         #: the goals that have spoken a word since they last waited for text
         self._heard: set[str] = set()
+        #: the goals that are interrupted
+        self._interrupted: set[str] = set()
         self._paused = False
         self._robot, self._boot = robot, boot
         self._widths = widths or ColumnWidths()
@@ -117,6 +128,8 @@ class Transcript:
             return self._format_snapshot(event, screen, now)
         if isinstance(event, StateChanged):
             return self._format_state_change(event, screen, now)
+        if isinstance(event, GoalInterrupted):
+            return [self._format_interruption(event.id, event.by.goal or "", event.at or now, screen)]
         if isinstance(event, PausedChanged):
             return [self._format_pause(event, screen, now)]
         if isinstance(event, TextAdded | TextMissing):
@@ -147,6 +160,8 @@ class Transcript:
         for goal in goals:
             since = goal.queued_at if goal.started_at is None else goal.started_at
             lines += self._format_goal(goal, goal.state, since or now, screen)
+            if goal.interrupted_by is not None:
+                lines.append(self._format_interruption(goal.id, goal.interrupted_by, now, screen))
         return lines
 
     def _format_state_change(self, event: StateChanged, screen: Screen, now: float) -> list[str]:
@@ -161,10 +176,14 @@ class Transcript:
             self._goals.pop(event.id, None)
             self._shown_chars.pop(event.id, None)
             self._heard.discard(event.id)
+        continues = event.id in self._interrupted
+        self._interrupted.discard(event.id)
         brief = event.state is State.PREEMPTING or (event.state is State.PENDING and starts_at_once)
         if brief and not self._full:
             return []
         at = event.at or now
+        if continues and event.state is State.ACTIVE:
+            return [self._head_columns(at, "continues", State.ACTIVE, event.id, screen).rstrip()]
         if goal is None:
             return [self._head_columns(at, event.state.name, event.state, event.id, screen).rstrip()]
         return self._format_goal(goal, event.state, at, screen)
@@ -189,6 +208,12 @@ class Transcript:
             self._heard.discard(event.id)
             lines.append(self._head_columns(at, "waiting", State.PREEMPTING, event.id, screen) + "for more text")
         return lines
+
+    def _format_interruption(self, goal_id: str, interrupted_by: str, timestamp: float, screen: Screen) -> str:
+        """Record that a goal is interrupted. Return a line that says so."""
+        self._interrupted.add(goal_id)
+        head = self._head_columns(timestamp, "paused", State.PREEMPTING, goal_id, screen)
+        return f"{head}interrupted by {screen.goal_id(interrupted_by)}"
 
     def _format_pause(self, event: PausedChanged, screen: Screen, now: float) -> str:
         """Store whether speech is paused. Return a line that says so."""

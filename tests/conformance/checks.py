@@ -5,6 +5,7 @@ The watcher reads in a thread, so these helpers first wait until the goals have 
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 from tests.support.watcher import TERMINAL
@@ -93,8 +94,13 @@ def assert_event_order(talk: Talk) -> None:
 
 
 def _check_goal(events: list[Message]) -> None:
-    """Assert that a goal's states are a valid sequence, and that its words come between ACTIVE and its end."""
-    steps = [event.get("state", "word") for event in events]
+    """Assert that a goal's states are a valid sequence, and that its words come between ACTIVE and its end.
+
+    An interrupted goal has no words until it is ACTIVE again.
+    """
+    steps = re.sub(
+        r"interrupted (interrupted )*(ACTIVE )?", "", "".join(f"{_step(event)} " for event in events)
+    ).split()
     states = [state for state in steps if state != "word"]
     assert states in STATE_SEQUENCES, events
     assert steps[0] != "word" != steps[-1], steps
@@ -107,14 +113,18 @@ def _check_goal(events: list[Message]) -> None:
     assert words == sorted(set(words)), words
 
 
+def _step(event: Message) -> str:
+    return "interrupted" if event["event"] == "interrupted" else str(event.get("state", "word"))
+
+
 def _check_one_at_a_time(events: Iterable[Message]) -> None:
-    """Assert that no goal becomes ACTIVE before the previous one has ended."""
+    """Assert that no goal becomes ACTIVE before the previous one has ended or was interrupted."""
     active = None
     for event in events:
         if event.get("state") == "ACTIVE":
             assert active is None, f"{event['id']} became ACTIVE while {active} was"
             active = event["id"]
-        elif event.get("state") in TERMINAL and event["id"] == active:
+        elif (event.get("state") in TERMINAL or event["event"] == "interrupted") and event["id"] == active:
             active = None
 
 

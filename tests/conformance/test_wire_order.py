@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 KEYS = {
     "id", "state", "status", "reason", "by", "message", "text", "format", "spoken", "spoken_end",
-    "heard", "priority", "key", "ttl", "data", "client", "paused", "more", "waits", "queued_at", "started_at",
-    "ended_at", "duration", "voice", "output",
+    "heard", "priority", "key", "ttl", "data", "client", "paused", "interrupted_by", "more", "waits",
+    "queued_at", "started_at", "ended_at", "duration", "voice", "output",
 }  # fmt: skip
 
 

@@ -19,6 +19,7 @@ def test_random_goals_survive_a_fault_every_few_seconds() -> None:
     print(report)
     assert report.ends.total() > 5 * SECONDS
     assert report.heard_whole > SECONDS / 30
+    assert report.stories["SUCCEEDED", True] > SECONDS / 30
 
 
 @pytest.mark.slow

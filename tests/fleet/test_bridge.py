@@ -328,6 +328,22 @@ def test_the_status_after_a_cancel_shows_the_final_state(robot: Robot) -> None:
         assert (status["active"], status["last"]["state"]) == (None, "PREEMPTED")
 
 
+def test_the_status_shows_the_goal_that_is_spoken_even_if_it_interrupts_another_one(robot: Robot) -> None:
+    with RemoteClient(robot.broker) as client:
+        first, waiting = client.say("never-ends words=1"), client.say("length=0")
+        client.say("never-ends", id="aside", interject=True)
+
+        def await_status(active: str, pending: int) -> None:
+            wanted = {"active": active, "pending": pending}.items()
+            retained(robot.broker, f"{ANNA}/status", lambda status: wanted <= status.items())
+
+        await_status("aside", 1)
+        client.ask("cancel", current=True)
+        await_status(first["id"], 1)
+        client.ask("cancel", ids=[first["id"]])
+        retained(robot.broker, f"{ANNA}/status", lambda status: status["last"]["id"] == waiting["id"])
+
+
 def test_the_status_contains_the_text_that_has_arrived(shared_robot: Robot, client: RemoteClient) -> None:
     goal = client.say("never-ends battery", more=True)
     topic = f"{ANNA}/status"

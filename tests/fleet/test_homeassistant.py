@@ -39,6 +39,17 @@ def test_a_message_is_spoken_and_the_entities_show_its_state(announced: Robot) -
     assert announced.spoken == [LONG, '{"request": "cancel"}']
 
 
+def test_an_interrupted_sentence_that_continues_counts_as_speaking(announced: Robot) -> None:
+    with HomeAssistant(announced.broker) as home:
+        device = home.device()
+        home.command(device, "say", "never-ends words=1")
+        home.await_states(device, state="speaking", speaking="ON", pending="0")
+        announced.talk.run("say", "--wait", "--interject", "length=0")
+        home.await_states(device, state="speaking", speaking="ON", pending="0", last="SUCCEEDED")
+        home.command(device, "cancel")
+        home.await_states(device, state="idle", last="PREEMPTED", speaking="OFF")
+
+
 def test_the_announcement_is_repeated_when_home_assistant_starts(announced: Robot) -> None:
     with HomeAssistant(announced.broker) as home:
         kept = home.await_message(lambda message: message.topic == ANNA)

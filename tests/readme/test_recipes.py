@@ -80,10 +80,12 @@ def test_the_microphone_is_muted_while_the_robot_speaks(scripted: Talk, scripted
         scripted.run("say", "--wait", "--", text)
         calls = scripted_shell.wait_for_call("wpctl", 2 * number)
         assert calls[-2:] == [["set-mute", "@DEFAULT_AUDIO_SOURCE@", value] for value in "10"]
-    scripted.run("say", "--", "never-ends")
+    scripted.run("say", "--", "never-ends words=1")
     scripted_shell.wait_for_call("wpctl", 5)
+    scripted.run("say", "--wait", "--interject", "--", "length=0")  # the first sentence continues afterwards
+    assert [call[-1] for call in scripted_shell.wait_for_call("wpctl", 8)[-4:]] == ["1", "1", "0", "1"]
     scripted.kill()
-    assert [call[-1] for call in scripted_shell.wait_for_call("wpctl", 6)[-2:]] == ["1", "0"]
+    assert [call[-1] for call in scripted_shell.wait_for_call("wpctl", 9)[-2:]] == ["1", "0"]
 
 
 @runs("More recipes: Watchdog")

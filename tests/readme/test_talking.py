@@ -140,3 +140,15 @@ def test_a_pause_ends_after_the_decision(speaking: Talk, shell: Shell) -> None:
         assert speaking.watcher.wait_for_terminal(goal_id) == state
         assert "speech is paused" in (shell.directory / "status").read_text("utf-8")
         assert not speaking.request("status")["server"]["paused"]
+
+
+@runs("Excuse me")
+def test_a_sentence_continues_after_another_one(speaking: Talk, shell: Shell) -> None:
+    done = shell.run(block("Excuse me"))
+    assert done.returncode == 0, done
+    first, aside = speaking.watcher.goals()
+    assert speaking.watcher.wait_for_terminal(first) == "SUCCEEDED"
+    states = [(event["id"], event["state"]) for event in speaking.watcher.events() if event["event"] == "state"]
+    assert states[3:] == [(aside, "ACTIVE"), (aside, "SUCCEEDED"), (first, "ACTIVE"), (first, "SUCCEEDED")]
+    words = [event["word"] for event in speaking.watcher.words(first)]
+    assert words == re.findall(r"\w+", speaking.goal(first)["text"])

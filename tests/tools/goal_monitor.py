@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 _NEXT_STATES: dict[str | None, set[str]] = {
     None: {"PENDING"},
     "PENDING": {"ACTIVE", "RECALLED"},
-    "ACTIVE": {"PREEMPTING", "SUCCEEDED", "ABORTED"},
+    "ACTIVE": {"PREEMPTING", "SUCCEEDED", "ABORTED", "INTERRUPTED"},
+    "INTERRUPTED": {"ACTIVE", "PREEMPTING", "INTERRUPTED"},
     "PREEMPTING": {"PREEMPTED", "SUCCEEDED", "ABORTED"},
 }
 #: A server sends a sign of life every 5 s.
@@ -95,7 +96,8 @@ class GoalMonitor:
     def _watch(self, wire: Wire) -> None:
         boot = wire.greeting["boot"]
         watch = wire.request("watch")
-        waiting = [item["pending"] for item in wire.items if "pending" in item]
+        interrupted = [item["interrupted"] for item in wire.items if "interrupted" in item]
+        waiting = [*interrupted, *(item["pending"] for item in wire.items if "pending" in item)]
         wire.items.clear()
         log = wire.request("log", count=_LOG_GOALS)
         assert watch["ok"], watch
@@ -104,6 +106,7 @@ class GoalMonitor:
         with self._changed:
             self._active = active and active["id"]
             self._states = {goal["id"]: goal["state"] for goal in [active, *waiting] if goal}
+            self._states |= {goal["id"]: "INTERRUPTED" for goal in interrupted}
             self._lengths = {goal["id"]: len(goal["text"]) for goal in [active, *waiting] if goal}
             self._ended_ids = set()  # a restarted server may use the same ids
             for goal in [active, *waiting, *(item["goal"] for item in wire.items)]:
@@ -121,10 +124,10 @@ class GoalMonitor:
     def _note(self, boot: str, event: Message) -> None:
         if event.get("event") == "text":
             self._grow(event["id"], event["start"], len(event["text"]))
-        if event.get("event") != "state":
+        if event.get("event") not in {"state", "interrupted"}:
             return
         with self._changed:
-            goal_id, state = event["id"], event["state"]
+            goal_id, state = event["id"], event.get("state", "INTERRUPTED")
             if state != "REJECTED":  # a rejected goal may have the same id as another goal
                 self._check(goal_id, state)
                 if state in TERMINAL:
@@ -158,9 +161,9 @@ class GoalMonitor:
             if self._active is not None:
                 self.faults.append(f"{goal_id} became ACTIVE while {self._active} was")
             self._active = goal_id
+        if self._active == goal_id and (state in TERMINAL or state == "INTERRUPTED"):
+            self._active = None
         if state in TERMINAL:
             self._ended_ids.add(goal_id)
-            if self._active == goal_id:
-                self._active = None
         else:
             self._states[goal_id] = state

@@ -1,4 +1,4 @@
-"""Soak test of a server: random goals and growing texts from many clients, and a fault every few seconds.
+"""Soak test of a server: many clients send goals of all kinds, and there is a fault every few seconds.
 
     python -m tests.tools.soak --seconds 1800 [--seed N] [--every SECONDS | --kills] [--player aplay|pacat]
 
@@ -26,9 +26,10 @@ from tests.tools.goal_monitor import GoalMonitor
 from tests.tools.soak_clients import Narrator, Workers, send_goals
 from tests.tools.soak_faults import RobotFaults
 from tests.tools.soak_growing import send_growing_texts
+from tests.tools.soak_interjecting import interject, read_stories, tell_stories
 
-#: Clients that send usual goals, and clients that send growing texts.
-_CLIENTS, _GROWING_CLIENTS = 8, 3
+#: Clients that send usual goals, clients that send growing texts, and clients that send interjections.
+_CLIENTS, _GROWING_CLIENTS, _INTERJECTING_CLIENTS = 8, 3, 2
 #: Goals before the first count of resources. By then, the history is almost full, and all code has run once.
 _WARM_UP_GOALS = 1_200
 _WARM_UP_LIMIT_S = 300.0
@@ -45,6 +46,9 @@ class Report:
     faults: Counter[str]
     heard_whole: int = 0  # sentences
     grown: Counter[tuple[str, str]] = field(default_factory=Counter)  # growing texts by what the client did
+    #: interrupted texts by state, and whether they were interrupted
+    stories: Counter[tuple[str, bool]] = field(default_factory=Counter)
+    interjections: Counter[str] = field(default_factory=Counter)  # by state
 
 
 class Soak:
@@ -57,6 +61,8 @@ class Soak:
         options = ("--player", player, "--max-queue", "20")
         self._talk = Talk(options, sink=self._sink, env={"TMPDIR": self._temporary}, watched=False)
         stack.callback(self._talk.close)
+        with self._talk.connect() as wire:
+            self._stories = read_stories(wire)
         self._monitor = stack.enter_context(contextlib.closing(GoalMonitor(self._talk.socket)))
 
     def run(self, seconds: float, every: float | None, min_faults: int) -> Report:
@@ -102,11 +108,18 @@ class Soak:
                 faults.run(every, over)
         finally:
             clients.stop(f"after {faults.done}; last fault: {faults.last}")
-        return Report(Counter(), faults.done, narrator.heard_whole, self._grown)
+        return Report(Counter(), faults.done, narrator.heard_whole, self._grown, self._told, self._interjected)
 
     def _start_senders(self, phase: str) -> Workers:
         workers = Workers()
         self._grown: Counter[tuple[str, str]] = Counter()
+        self._told: Counter[tuple[str, bool]] = Counter()
+        self._interjected: Counter[str] = Counter()
+        rng = random.Random(f"{self._seed} {phase} stories")
+        workers.start("stories", partial(tell_stories, self._talk, self._stories, self._told, rng))
+        for number in range(_INTERJECTING_CLIENTS):
+            rng = random.Random(f"{self._seed} {phase} interjections {number}")
+            workers.start(f"interjections {number}", partial(interject, self._talk, self._interjected, rng))
         for number in range(_CLIENTS + _GROWING_CLIENTS):
             rng = random.Random(f"{self._seed} {phase} {number}")
             send = partial(send_goals, self._talk)

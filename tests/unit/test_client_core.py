@@ -29,7 +29,16 @@ from talkcli.errors import (
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Append, Cancel, Pause, Say
 from talkcli.goals.states import State
-from talkcli.protocol.events import PausedChanged, Result, Snapshot, StateChanged, TextAdded, TextMissing, WordHeard
+from talkcli.protocol.events import (
+    GoalInterrupted,
+    PausedChanged,
+    Result,
+    Snapshot,
+    StateChanged,
+    TextAdded,
+    TextMissing,
+    WordHeard,
+)
 from talkcli.protocol.lines import decode, encode
 from talkcli.protocol.requests import Status, Wait
 
@@ -582,6 +591,19 @@ def test_word_events_are_kept_only_with_feedback_and_unknown_events_never(core: 
     for tracked, kinds in ((plain, [Result]), (fed, [WordHeard, PausedChanged, TextMissing, Result])):
         assert [type(tracked._take()) for _ in kinds] == kinds
         assert tracked.speech_paused
+
+
+def test_an_interrupted_goal_is_paused_until_it_continues(core: ClientCore) -> None:
+    tracked = say(core)
+    receive(core, {"seq": 1, "ok": True, "goal": goal()}, state("ACTIVE", 1))
+    receive(core, {"event": "interrupted", "id": "g", "by": {"goal": "aside"}, "n": 2})
+    resumed: JsonObject = {"event": "paused", "paused": False, "id": "aside", "by": None, "n": 3}
+    receive(core, resumed)  # a pause of the other goal has ended
+    assert (tracked.goal.state, tracked.goal.paused, tracked.goal.interrupted_by) == (State.ACTIVE, True, "aside")
+    receive(core, state("ACTIVE", 4))
+    assert (tracked.goal.state, tracked.goal.paused, tracked.goal.interrupted_by) == (State.ACTIVE, False, None)
+    kinds = [StateChanged, GoalInterrupted, StateChanged]
+    assert [type(tracked._take()) for _ in kinds] == kinds
 
 
 def test_a_watch_gets_each_state_once_with_the_full_goal(core: ClientCore) -> None:

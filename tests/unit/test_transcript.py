@@ -14,6 +14,7 @@ from talkcli.goals.goal import By, Goal, Sender
 from talkcli.goals.states import State
 from talkcli.protocol.events import (
     Event,
+    GoalInterrupted,
     PausedChanged,
     ServerStatus,
     Snapshot,
@@ -254,9 +255,10 @@ def test_a_growing_text_is_shown_by_sentences_and_waits_are_shown_once() -> None
         ({"more": True}, "ACTIVE", '"battery low…"', "for 2.0 s"),
         ({"waits": True, "paused": True}, "ACTIVE, paused, waiting for text", '"battery low"', "paused, waiting for"),
         ({"more": True, "waits": True, "state": State.ABORTED}, "ABORTED", '"battery low"', ""),
+        ({"paused": True, "interrupted_by": "8"}, "ACTIVE, interrupted by 8", '"battery low"', "interrupted by 8, for"),
     ],
 )
-def test_a_goal_that_waits_for_text_says_so(changes: dict[str, object], state: str, text: str, now: str) -> None:
+def test_a_silent_goal_says_why(changes: dict[str, object], state: str, text: str, now: str) -> None:
     goal = replace(GOAL, **{"state": State.ACTIVE, "started_at": NOON - 2, **changes})
     rows = dict(line.split(maxsplit=1) for line in goal_lines(goal, Screen(), NOON))
     assert (rows["state"], rows["text"]) == (state, text)
@@ -264,6 +266,33 @@ def test_a_goal_that_waits_for_text_says_so(changes: dict[str, object], state: s
     assert text in line
     assert now in line
     assert ("waiting" in line) == ("waiting" in state)
+
+
+def test_interrupted_goals_are_shown_between_the_current_one_and_the_queue() -> None:
+    aside = replace(GOAL, id="4k7f-8", state=State.ACTIVE, started_at=NOON)
+    interrupted = replace(aside, id="4k7f-7", paused=True, interrupted_by="4k7f-8")
+    status = ServerStatus(SERVER, aside, (replace(GOAL, id="4k7f-9"),), (), (interrupted,))
+    shown = [line.split()[:2] for line in status_lines(status, Screen(), NOON)[3:]]
+    assert shown == [["now", "8"], ["next", "7"], ["queue", "9"], ["said", "nothing"]]
+    lines = Transcript(full=False, words=False).lines(Snapshot(status), Screen(80), NOON)
+    assert [line[10:].split('"')[0].split() for line in lines[1:]] == [
+        ["ACTIVE", "8"],
+        ["ACTIVE", "7"],
+        ["paused", "7", "interrupted", "by", "8"],
+        ["PENDING", "9"],
+    ]
+
+
+def test_an_interruption_and_its_end_are_shown() -> None:
+    transcript = Transcript(full=False, words=False, boot="4k7f")
+    events: list[Event] = [
+        StateChanged(GOAL.id, State.PENDING, NOON, goal=GOAL),
+        StateChanged(GOAL.id, State.ACTIVE, NOON),
+        GoalInterrupted(GOAL.id, By(goal="4k7f-8"), NOON),
+        StateChanged(GOAL.id, State.ACTIVE, NOON),
+    ]
+    lines = [line for event in events for line in transcript.lines(event, Screen(80), NOON)]
+    assert lines[1:] == ["12:00:00  paused      7    interrupted by 8", "12:00:00  continues   7"]
 
 
 def test_forms_of_a_sender_get_shorter_and_keep_the_script() -> None:

@@ -35,6 +35,7 @@ CHECKSUMS = {
     "protocol-1-audible": "d027e998482272e961e2bebded96fb3d2d3dc4e2410b2d2fd6c0ea2076ce131a",
     "protocol-1-dry-run": "584db313224a04b20bac60f133224c7cc4a4b3a0986cf7808777a71642f35164",
     "protocol-1-growing": "275717f75fd059b2cc27becc7d3b7d24ba731d2ab482d29acf397fb6fbd42cb4",
+    "protocol-1-interject": "e891b047c63f0828fd74ae6ec3dde3133d69bbd0f0c0aee769292cd62af3bd9d",
     "protocol-1-lead-in": "3f3263930adb3116d5329efa626e6eaefc47f16290d539d36e352152bc22067e",
     "protocol-1-log": "e6bff73cab3772ced91ee80a2fcfd19a7ee4229aa486dffe357b078973987d15",
     "protocol-1-markdown": "2f65ff7f254ecbd5789e58ac5fb504248d0b3ba2d6cd9b4b746a238dedbab871",

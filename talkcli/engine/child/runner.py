@@ -513,7 +513,7 @@ class GoalRunner:
         goal, self._goal = self._goal, None
         before, duration, heard = goal.command.heard, self.duration, self.heard
         duration = None if duration is None else round(before + duration, 6)
-        heard = None if heard is None else round(before + heard, 3)
+        heard = None if heard is None else round(before + heard, 6)
         if self._step_run_loop is not None:
             heard = round(goal.speech_seconds(time.monotonic()), 3)
         gaps = len(self.gaps), round(sum(self.gaps), 3)

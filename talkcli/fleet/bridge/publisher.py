@@ -22,6 +22,7 @@ from talkcli.frozen import fields, replace
 from talkcli.goals.options import MAX_LOG_GOALS, Log
 from talkcli.goals.states import State
 from talkcli.protocol.events import (
+    GoalInterrupted,
     PausedChanged,
     ServerStatus,
     StateChanged,
@@ -77,6 +78,8 @@ class Publisher:
         self._texts: dict[str, str | None] = {}
         #: id of the active goal
         self._active: str | None = None
+        #: ids of the interrupted goals
+        self._interrupted: set[str] = set()
         #: the goal that ended last
         self._last: Goal | None = None
         self._paused = False
@@ -168,6 +171,7 @@ class Publisher:
         """Replace what is stored about the server and its goals, and report the change."""
         self.server = server_info
         self._active = status.active.id if status.active else None
+        self._interrupted = {each.id for each in status.interrupted}
         self._texts = {each.id: _shown_text(each) for each in unfinished(status)}
         self._last = status.recent[-1] if status.recent else self._last
         self._paused = status.server.get("paused") is True
@@ -186,6 +190,9 @@ class Publisher:
                 line = encode(replace(event, goal=goal).to_json()).removesuffix(b"\n")
         elif isinstance(event, PausedChanged):
             self._paused = event.paused
+        elif isinstance(event, GoalInterrupted):
+            self._active = None if self._active == event.id else self._active
+            self._interrupted.add(event.id)
         else:
             if isinstance(event, TextAdded):
                 self._add_text(event)
@@ -196,6 +203,7 @@ class Publisher:
 
     def _update_goals(self, event: StateChanged) -> None:
         """Update the stored active goal, last goal and texts from an event."""
+        self._interrupted.discard(event.id)
         if event.state is State.PENDING:
             self._texts[event.id] = _shown_text(event.goal)
         elif event.state is State.ACTIVE:
@@ -224,7 +232,8 @@ class Publisher:
         active, last = self._active, self._last
         text = self._texts.get(active) if active else None
         ended = LastGoal(last.id, last.state, last.reason, _shown_text(last), last.ended_at) if last else None
-        status = RobotStatus(active, text, len(self._texts.keys() - {active}), self._paused, ended).to_json()
+        pending = len(self._texts.keys() - {active} - self._interrupted)
+        status = RobotStatus(active, text, pending, self._paused, ended).to_json()
         payload = encode(status)
         if not self._sessions.with_text or len(payload) > self._sessions.max_payload():
             for each in (status, status["last"]):

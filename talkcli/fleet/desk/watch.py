@@ -19,7 +19,7 @@ from talkcli.fleet.payloads import Message, Presence, RobotInfo, RobotStatus
 from talkcli.frozen import frozen
 from talkcli.goals.states import State
 from talkcli.polling import run_blocking
-from talkcli.protocol.events import PausedChanged, StateChanged, from_json
+from talkcli.protocol.events import GoalInterrupted, PausedChanged, StateChanged, from_json
 from talkcli.protocol.lines import decode
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class RobotEvent:
     """An event of one robot, with the JSON message from which it was read."""
 
     name: str
-    event: StateChanged | PausedChanged
+    event: StateChanged | GoalInterrupted | PausedChanged
     message: JsonObject
 
 
@@ -336,7 +336,9 @@ def _read_event(message: Message) -> RobotEvent | None:
         event = from_json(content)
     except (BadRequest, ValueError):
         return None
-    return RobotEvent(name, event, content) if isinstance(event, StateChanged | PausedChanged) else None
+    if not isinstance(event, StateChanged | GoalInterrupted | PausedChanged):
+        return None
+    return RobotEvent(name, event, content)
 
 
 def _identity(presence: Presence | None) -> tuple[object, ...]:

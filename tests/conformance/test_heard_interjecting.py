@@ -1,0 +1,151 @@
+"""Interjections, as they are heard and as clients see them.
+
+`tests/unit/test_scheduler_interject.py` has the rules of which goal is spoken next.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from talkcli.engine.child.playback import FADE_S
+from tests.conformance import stopped
+from tests.conformance.checks import assert_event_order
+from tests.conformance.hearing import (
+    HOME,
+    LONG,
+    LOW,
+    QUICK,
+    await_word,
+    engine_process,
+    heard,
+    render_quick,
+    send,
+    start_goal,
+)
+from tests.support.compare import matching_length
+from tests.support.reference import RATE
+from tests.support.timing import assert_within, limits
+
+if TYPE_CHECKING:
+    from tests.conftest import MakeTalk
+    from tests.support.processes import Talk
+    from tests.support.sink import Sink
+
+#: The second word takes longer than a second.
+NUMBER = "one 12345678 three"
+
+
+def word_places(talk: Talk, goal_id: str) -> list[tuple[int, str]]:
+    return [(word["number"], word["word"]) for word in talk.watcher.words(goal_id)]
+
+
+@pytest.mark.parametrize("player", ["pulse", "pacat"])
+def test_a_sentence_is_heard_to_the_end_of_a_word_and_continues_after_the_interjection(
+    make_talk: MakeTalk, sink: Sink, player: str
+) -> None:
+    talk = make_talk("--player", player, "--rate", str(QUICK), sink=sink)
+    goal = start_goal(talk, LONG)
+    send(talk, LOW)
+    aside = send(talk, HOME, interject=True)
+    await_word(talk, aside, 1)
+    with talk.connect() as wire:
+        status = wire.request("status")
+        (interrupted,) = (item["interrupted"] for item in wire.items if "interrupted" in item)
+        assert wire.request("wait")["count"] == 3
+    assert (status["active"]["id"], interrupted["id"]) == (aside, goal)
+    assert (interrupted["state"], interrupted["paused"], interrupted["interrupted_by"]) == ("ACTIVE", True, aside)
+    assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
+    rest = LONG[len(interrupted["spoken"]) :].lstrip()
+    samples = heard(talk)
+    fade_begin = matching_length(samples, render_quick([LONG])[0])
+    assert fade_begin / RATE > interrupted["heard"] / 2, "the beginning differs"
+    after = samples[fade_begin + round(FADE_S * RATE) :]
+    stopped.assert_heard_after_stop(after, LONG, [HOME, rest, LOW], first_heard=False)
+    assert word_places(talk, goal) == list(enumerate(LONG.split(), 1))
+    assert talk.watcher.texts("ACTIVE") == [LONG, HOME, LONG, LOW]
+    assert_event_order(talk)
+
+
+def test_the_rest_of_a_goal_keeps_its_rate_and_the_whole_goal_is_reported(soundless: Talk) -> None:
+    talk = soundless
+    whole = start_goal(talk, LONG)
+    assert talk.watcher.wait_for_terminal(whole) == "SUCCEEDED"
+    goal = start_goal(talk, LONG)
+    aside = send(talk, HOME, interject=True)
+    assert talk.request("set", rate=80)["ok"]
+    assert talk.watcher.wait_for_terminal(aside) == "SUCCEEDED"
+    assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
+    expected, found = talk.goal(whole), talk.goal(goal)
+    assert word_places(talk, goal) == word_places(talk, whole)
+    assert (found["spoken"], found["spoken_end"]) == (LONG, len(LONG))
+    assert (found["duration"], found["heard"]) == (pytest.approx(expected["duration"], abs=0.2),) * 2
+    assert (found["paused"], found["interrupted_by"], found["voice"]) == (False, None, expected["voice"])
+
+
+def test_a_pause_before_the_end_of_the_word_is_confirmed_at_its_end(soundless: Talk) -> None:
+    talk = soundless
+    goal = start_goal(talk, NUMBER, number=2)
+    with limits():
+        aside, requested_at = send(talk, HOME, interject=True), time.monotonic()
+        reply = talk.request("pause")
+        assert (reply["ok"], reply["goal"]["id"], reply["goal"]["interrupted_by"]) == (True, goal, aside)
+        assert_within(time.monotonic() - requested_at, 1.2, "the end of a long word")
+    assert talk.request("status")["active"] is None
+    assert talk.request("pause")["goal"] is None  # nothing is being spoken
+    assert talk.request("resume")["ok"]
+    assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
+    assert talk.watcher.texts("ACTIVE") == [NUMBER, HOME, NUMBER]
+    assert word_places(talk, goal) == list(enumerate(NUMBER.split(), 1))
+
+
+def test_a_cancel_ends_interrupted_goals_too(soundless: Talk) -> None:
+    talk = soundless
+    goal = start_goal(talk, LONG)
+    aside = send(talk, LONG, interject=True)
+    await_word(talk, aside, 1)
+    with talk.connect() as wire:
+        assert wire.request("cancel")["count"] == 2
+        assert {item["canceled"]["id"] for item in wire.items} == {goal, aside}
+    assert talk.watcher.states(goal) == ["PENDING", "ACTIVE", "PREEMPTING", "PREEMPTED"]
+    assert talk.goal(goal)["message"] == "Talk preempted: the goal was cancelled"
+
+
+def test_an_interrupted_goal_continues_after_the_death_of_the_engine(soundless: Talk) -> None:
+    talk = soundless
+    goal = start_goal(talk, LONG)
+    aside = start_goal(talk, LONG, number=1, interject=True)
+    os.kill(engine_process(talk), signal.SIGKILL)
+    assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
+    assert talk.goal(aside)["reason"] == "engine_crashed"
+    assert word_places(talk, goal) == list(enumerate(LONG.split(), 1))
+
+
+def test_a_growing_text_that_waits_for_text_is_interrupted_at_once_and_continues(soundless: Talk) -> None:
+    talk = soundless
+    with talk.connect() as wire:
+        goal = wire.request("say", text="One two. ", more=True, feedback=True, stall=1)["goal"]["id"]
+        await_word(talk, goal, 2)
+        wire.receive_event("waits", waits=True)
+        aside = send(talk, NUMBER, interject=True)  # longer than the limit for missing text
+        wire.receive_event("waits", waits=False)
+        assert wire.receive_event("interrupted")["by"] == {"goal": aside}
+        assert wire.request("append", id=goal, text="Three four.")["state"] == "ACTIVE"
+        assert talk.watcher.wait_for_terminal(aside) == "SUCCEEDED"
+        await_word(talk, goal, 4)
+        assert wire.request("append", id=goal, end=True)["ok"]
+        assert wire.receive_event("result")["goal"]["state"] == "SUCCEEDED"
+    assert [word for _, word in word_places(talk, goal)] == ["One", "two", "Three", "four"]
+
+
+def test_nothing_is_interrupted_that_is_written_to_a_file(make_talk: MakeTalk, home: str) -> None:
+    talk = make_talk("--player", f"file:{home}/out.wav")
+    goal = start_goal(talk, " ".join([LONG] * 160), number=1)
+    aside = send(talk, HOME, interject=True)
+    assert talk.watcher.wait_for_terminal(aside) == "SUCCEEDED"
+    assert [event["id"] for event in talk.watcher.events() if event.get("state") == "SUCCEEDED"] == [goal, aside]
+    assert not any(event["event"] == "interrupted" for event in talk.watcher.events())
