@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from tests.support.processes import Talk
 
 GOAL = {
-    "id", "state", "status", "reason", "by", "message", "text", "format", "spoken", "spoken_end",
+    "id", "state", "status", "reason", "by", "message", "text", "format", "said", "spoken", "spoken_end",
     "heard", "priority", "key", "ttl", "data", "client", "paused", "interrupted_by", "more", "waits",
     "queued_at", "started_at", "ended_at", "duration", "voice", "output",
 }  # fmt: skip
@@ -109,7 +109,7 @@ def test_json_output_has_the_documented_fields(scripted: Talk) -> None:
     pending = json.loads(scripted.run("say", "behind", "it", "--json").out)  # the option may follow the command
     assert (pending["state"], pending["text"], pending["spoken"]) == ("PENDING", "behind it", None)
     status = json.loads(scripted.run("status", "--json").out)
-    assert status.keys() == {"server", "active", "pending", "recent"}
+    assert status.keys() == {"server", "active", "interrupted", "pending", "recent"}
     assert (status["active"]["id"], [goal["id"] for goal in status["pending"]]) == (goal["id"], [pending["id"]])
     assert json.loads(scripted.run("status", "--json", goal["id"]).out).keys() == GOAL
     canceled = [json.loads(line) for line in scripted.run("cancel", "--json").out.splitlines()]

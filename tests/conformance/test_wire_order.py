@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tests.support.processes import Talk
 
 KEYS = {
-    "id", "state", "status", "reason", "by", "message", "text", "format", "spoken", "spoken_end",
+    "id", "state", "status", "reason", "by", "message", "text", "format", "said", "spoken", "spoken_end",
     "heard", "priority", "key", "ttl", "data", "client", "paused", "interrupted_by", "more", "waits",
     "queued_at", "started_at", "ended_at", "duration", "voice", "output",
 }  # fmt: skip

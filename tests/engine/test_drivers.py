@@ -378,6 +378,7 @@ class Recorder:
         self.word: TimedWord | None = None
         self.ended_early: EndedEarly | None = None
         self.word_end_due: float | None = None
+        self.text_start = 0
         self.duration: float | None = None
         self.heard: float | None = None
         self.growing_text: GrowingText | None = None
