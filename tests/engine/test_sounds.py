@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import os
+from array import array
+from contextlib import suppress
 from typing import TYPE_CHECKING
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from talkcli.engine import protocol, sounds
+from talkcli.engine.child.players.base import Stopped
+from talkcli.engine.child.players.builtin import WavPlayer
+from talkcli.engine.child.sounds import play_sound, resample
 from talkcli.engine.sounds import SoundLibrary
 from tests.engine.process import Engine
 from tests.engine.programs import NEVER_READS, without_silence
@@ -144,8 +150,38 @@ def test_a_file_of_the_same_name_replaces_a_built_in_sound(tmp_path: Path) -> No
         assert completed(started(engine), "chirp") == pytest.approx(0.02, abs=0.001)
 
 
+@pytest.mark.parametrize("rates", [(48_000, 11_025), (22_050, 16_000), (8_000, 22_050)])
+def test_a_sound_is_resampled_alike_in_pieces_of_any_length(rates: tuple[int, int]) -> None:
+    whole = array("h", (tone(0.1, rates[0]) * 32_767).astype("<i2").tobytes())
+    pieces = [whole[start : start + 7] for start in range(0, len(whole), 7)]
+    found, expected = (np.concatenate([*resample(some, *rates)]).astype(int) for some in (pieces, [whole]))
+    assert len(found) == len(expected) == pytest.approx(0.1 * rates[1], abs=1)
+    assert np.abs(found - expected).max() <= 1
+
+
+def test_the_file_of_a_sound_is_closed_however_it_ends(tmp_path: Path) -> None:
+    write_tone(tmp_path / "a.wav", 0.1, RATE)
+    command, library = protocol.Speak("g", "a", 200, 1.0, None, 50, format="sound"), SoundLibrary(str(tmp_path))
+    for side_effect in (None, Stopped):
+        playback = Mock(**{"write.side_effect": side_effect})
+        open_before = os.listdir("/dev/fd")
+        with suppress(Stopped):
+            play_sound(library, command, playback, None)
+        assert playback.write.called
+        assert len(os.listdir("/dev/fd")) == len(open_before)
+
+
+@pytest.mark.parametrize("rate", [16_000, 44_100])
+def test_sounds_get_the_rate_of_an_existing_wav_file(tmp_path: Path, rate: int) -> None:
+    output = tmp_path / "said.wav"
+    WavPlayer(str(output), rate).close()
+    with Engine(f"file:{output}") as engine:
+        assert completed(engine, "chirp") == pytest.approx(0.14, abs=0.001)
+    assert output.stat().st_size == pytest.approx(44 + (0.14 + PAUSE_S) * rate * 2, abs=8)
+
+
 @pytest.mark.parametrize("first", ["say", "play"])
-def test_sounds_are_converted_to_the_rate_of_a_wav_file(tmp_path: Path, first: str) -> None:
+def test_sounds_are_converted_to_the_rate_of_a_voice_in_a_wav_file(tmp_path: Path, first: str) -> None:
     for rate in (8_000, 44_100, 96_000):
         write_tone(tmp_path / f"{rate}.wav", 0.5, rate)
     output = tmp_path / "said.wav"
@@ -225,6 +261,11 @@ BAD_FILES: dict[str, tuple[Callable[[Path], object], str, str]] = {
     "64 bits": (_tone(bits=64), ".wav", "64-bit integer samples; convert it with: ffmpeg -i "),
     "64-bit float": (_tone(bits=64, number=FLOAT), ".wav", "64-bit floating-point samples; convert it with: ffmpeg"),
     "unknown": (_tone(number=99), ".wav", "16-bit unknown (99) samples; convert it with: ffmpeg -i "),
+    "padded samples": (
+        _file(HEADER[:32] + b"\4\0" + HEADER[34:] + bytes(99)),
+        ".wav",
+        "4 bytes for 1 samples of 16 bits;",
+    ),
     "six channels": (_tone(channels=6), ".wav", "has 6 channels instead of 1 or 2; convert it with: ffmpeg -i "),
     "1 kHz": (_tone(rate=1_000), ".wav", "1,000 samples per second instead of 4,000 to 192,000; convert it"),
     "directory": (lambda path: path.mkdir(), ".wav", "is a directory; use a WAV file"),
@@ -292,9 +333,12 @@ def test_an_unknown_name_is_refused_with_advice(tmp_path: Path, name: str, words
 
 
 def test_the_names_are_those_of_wav_files_and_built_in_sounds(tmp_path: Path) -> None:
+    (tmp_path / "bell.xyz").touch()
+    open_before = os.listdir("/dev/fd")
     for name in ("bell.wav", "HORN.WAV", "song.mp3", "a b.wav", "bad\n.wav"):
         write_tone(tmp_path / name, 0.1, RATE)
     library = SoundLibrary(str(tmp_path))
     assert library.names() == ["HORN", "a b", "bell", "chirp", "error", "warning"]
     assert [library.refusal(name) for name in library.names()] == [None] * 6
+    assert len(os.listdir("/dev/fd")) == len(open_before)
     assert SoundLibrary(f"{tmp_path}/gone").names() == ["chirp", "error", "warning"]

@@ -299,3 +299,14 @@ def test_a_thousand_early_cancels_are_stored_and_the_oldest_is_dropped(monkeypat
     robot = play("cancel one two three; cancel one four; cancel 4k7f-8 9z9z-7 17 -x")
     robot.play("a id=one; b id=three; c id=four; d id=two")
     assert robot.outcome() == "d ACTIVE; a b c RECALLED canceled by door"
+
+
+def test_a_sound_has_no_words_and_counts_as_heard_if_some_of_it_was() -> None:
+    robot = play("set voice=piper/joe; a format=sound; cancel a; stopped a; b text=a format=sound throttle=60")
+    assert robot.outcome() == "b ACTIVE; a PREEMPTED canceled by door"
+    robot.scheduler.audio_heard(robot.goals["b"].id, 0.5)
+    robot.play("cancel b; stopped b; c text=a format=sound throttle=60")
+    assert robot.goals["c"].reason == "throttled"
+    goal = robot.goals["b"].snapshot()
+    assert (goal.heard, goal.spoken, goal.spoken_end) == (0.5, None, None)
+    assert robot.scheduler.wanted_voice(robot.goals["b"]) == ""

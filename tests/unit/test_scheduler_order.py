@@ -92,10 +92,12 @@ a text is throttled while it is spoken
     a; pass 99; b text=a throttle=60  ->  a ACTIVE; b REJECTED throttled by a
 a sound is throttled by its name
     a format=sound; b text=a format=sound throttle=60  ->  a ACTIVE; b REJECTED throttled by a
+a pending sound throttles its name
+    a; b text=c format=sound; c format=sound throttle=9  ->  a ACTIVE; b PENDING; c REJECTED throttled by b
 a sound is throttled after it was played
     a format=sound; completed a; b text=a format=sound throttle=60  ->  a SUCCEEDED; b REJECTED throttled by a
 a sound and a text that is its name don't throttle each other
-    a; b text=a format=sound throttle=60; c text=a throttle=60  ->  a ACTIVE; b PENDING; c REJECTED throttled by a
+    a; b text=a format=sound throttle=9; c text=b; d text=b format=sound throttle=9  ->  a ACTIVE; b c d PENDING
 a text is not throttled by another text
     a; b throttle=60  ->  a ACTIVE; b PENDING
 a goal without a throttle is not throttled but throttles others
