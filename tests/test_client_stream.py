@@ -152,7 +152,7 @@ def test_a_write_fails_if_the_server_is_gone(soundless: Talk, client: Client) ->
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"stall": 0.5}, "the stall must be 1 to 60, got 0.5"),
+        ({"stall": 0.5}, "the stall must be 1 to 60 seconds, got 0.5"),
         ({"throttle": 5}, "a growing text can only be throttled by its key"),
         ({"rate": "fast"}, "'rate' must be an integer"),
     ],

@@ -161,7 +161,7 @@ def test_the_whole_text_must_not_be_too_long(make_talk: MakeTalk) -> None:
         (["--stream", "--lines"], "--stream speaks standard input as one text"),
         (["--stream", "-o", "x.wav"], "--output writes a file without a server; leave out --stream"),
         (["--stall", "5", "hello"], "--stall only works with --stream; add --stream, or leave out --stall"),
-        (["--stream", "--stall", "0"], "--stall: must be 1 to 60, got 0"),
+        (["--stream", "--stall", "0"], "--stall: must be 1 to 60 seconds, got 0"),
         (["--stream", "--robot", "@all"], "'talk say --stream' only works with one robot"),
     ],
 )

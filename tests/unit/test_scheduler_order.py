@@ -231,6 +231,8 @@ a pause without a limit outlasts listeners and times
     a; pause; pause connection=x seconds=600; pause seconds=5; gone x; wait 999  ->  a ACTIVE paused
 a pause without a limit follows one with a time
     a; pause seconds=5; pause; wait 999  ->  a ACTIVE paused
+speech is paused until the last of several pauses ends
+    a; pause connection=x seconds=5; pause connection=y seconds=9; wait 6  ->  a ACTIVE paused
 the longer of two times counts
     a; pause seconds=9; pause seconds=5; wait 8.9  ->  a ACTIVE paused
 resume ends all pauses
