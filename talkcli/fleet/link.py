@@ -97,9 +97,6 @@ class Link:
             max_packet_bytes: largest packet that the broker may send.
             receive_maximum: how many unacknowledged QoS 1 messages the broker may send. If None, the broker's default
                 applies, so that a flood of messages can't stop mosquitto from delivering later ones.
-
-        Raises:
-            UsageError: a certificate or key file is unusable.
         """
         self._broker = broker
         self._deliver = on_message
@@ -126,8 +123,6 @@ class Link:
             CallbackAPIVersion.VERSION2, client_id, protocol=paho.MQTTv5, reconnect_on_failure=False
         )
         self._paho.max_inflight_messages_set(_MAX_UNACKNOWLEDGED_MESSAGES)
-        if context := broker.ssl_context():
-            self._paho.tls_set_context(context)
         if broker.user is not None:
             self._paho.username_pw_set(broker.user, broker.password)
         if will:
@@ -142,6 +137,7 @@ class Link:
         """Connect to the broker, and wait until it has accepted the login.
 
         Raises:
+            UsageError: a certificate or key file is unusable.
             ServerUnavailable: no broker answers.
             AccessDenied: the broker's certificate isn't trusted, or the broker rejects the login.
             ProtocolMismatch: the broker doesn't speak MQTT 5.
@@ -153,6 +149,8 @@ class Link:
         if self._receive_maximum is not None:
             properties.ReceiveMaximum = self._receive_maximum
         self._paho.connect_timeout = LOGIN_LIMIT_S
+        if context := self._broker.ssl_context():  # reading the system's CAs takes about 40 ms
+            self._paho.tls_set_context(context)
         try:
             self._paho.connect(
                 self._broker.host, self._broker.port, KEEPALIVE_S, clean_start=True, properties=properties
