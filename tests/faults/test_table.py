@@ -18,7 +18,7 @@ _HEAD = re.compile(r"\| (---|fault|it covers|line|text) \|")
 @functools.cache
 def functions(path: Path) -> set[str]:
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    return {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+    return {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)}
 
 
 @pytest.mark.parametrize("folder", ["tests/faults", "tests/fleet"])

@@ -19,10 +19,18 @@ if TYPE_CHECKING:
     from tests.readme.shell import Shell
     from tests.support.processes import Talk
 
-#: The model prints its prompt, lets the person interrupt before the first word of the second answer, and can fail.
+#: Changes of the examples, so that the model prints its prompt, lets the person interrupt before the first word of the
+#: second answer, and can fail.
 _CHANGES = {
-    "    for word": "    print(history)\n    while len(history) == 3 > len(said): time.sleep(0.01)\n    for word",
-    "        yield": '        assert said[-1] != "fail" or word != "9", "no model"\n        yield',
+    "In Python": {
+        "    for word": "    print(history)\n    while len(history) == 3 > len(said): time.sleep(0.01)\n    for word",
+        "        yield": '        assert said[-1] != "fail" or word != "9", "no model"\n        yield',
+    },
+    "A dialogue": {
+        "    for word": "    print(history)\n    while len(history) == 3: await asyncio.sleep(0.01)\n    for word",
+        "        yield word": '        assert history[-1]["content"] != "fail" or word != "9", "no model"\n'
+        "        yield word",
+    },
 }
 
 
@@ -39,11 +47,12 @@ def wait_for_word(talk: Talk, answer: str) -> str:
     return str(event["id"])
 
 
-@runs("In Python")
-def test_the_history_of_a_dialogue_contains_what_was_heard(speaking: Talk) -> None:
+@runs("In Python", "A dialogue")
+@pytest.mark.parametrize("name", _CHANGES)
+def test_the_history_of_a_dialogue_contains_what_was_heard(speaking: Talk, name: str) -> None:
     talk = speaking
-    code = block("In Python")
-    for old, new in _CHANGES.items():
+    code = block(name)
+    for old, new in _CHANGES[name].items():
         assert code.count(old) == 1
         code = code.replace(old, new)
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
@@ -66,7 +75,7 @@ def test_the_history_of_a_dialogue_contains_what_was_heard(speaking: Talk) -> No
         assert history() == [("user", "hello")]
         goal_id = wait_for_word(talk, "You said: hello.")
         dialogue.stdin.write("wait\n")
-        talk.watcher.wait_for(goal_id, "PREEMPTED")
+        talk.watcher.wait_for_terminal(goal_id)
         first = [("user", "hello"), *heard(goal_id)]
         assert history() == first
         words = [word["word"] for word in talk.watcher.words(goal_id)]

@@ -46,6 +46,7 @@ README = Document("README.md")
 COMMAND_LINE = Document("talkcli/cli/README.md")
 WIRE = Document("talkcli/protocol/README.md")
 TALKING = Document("talkcli/client/README.md")
+ASYNCIO = Document("talkcli/aio/README.md")
 DOCTOR = Document("talkcli/doctor/README.md")
 SERVICES = Document("talkcli/daemon/README.md")
 FLEET = Document("talkcli/fleet/README.md")
@@ -53,7 +54,7 @@ INTERNALS = Document("talkcli/README.md")
 BENCHMARK = Document("tests/tools/bench/README.md")
 CONTRIBUTING = Document(".github/CONTRIBUTING.md")
 DOCUMENTS = (
-    *(README, COMMAND_LINE, TALKING, DOCTOR, SERVICES, WIRE, FLEET, INTERNALS, BENCHMARK, CONTRIBUTING),
+    *(README, COMMAND_LINE, TALKING, ASYNCIO, DOCTOR, SERVICES, WIRE, FLEET, INTERNALS, BENCHMARK, CONTRIBUTING),
     *(Document(path) for path in ("tests/faults/README.md", "tests/fleet/README.md", "tests/fresh/README.md")),
 )
 
