@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli import paths
-from talkcli.cli.log import HISTORY_FAILED
-from talkcli.errors import RequestRefused
+from talkcli.cli.log import HISTORY_FAILED, log
+from talkcli.cli.show import CommonOptions
+from talkcli.errors import RequestRefused, ServerUnavailable
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Log
 from talkcli.goals.states import State
@@ -27,7 +28,6 @@ from talkcli.history.file import HistoryError, HistoryWriter
 from talkcli.history.rows import to_row
 from talkcli.server import history
 from talkcli.server.connection import PendingRequest
-from tests.conformance.bareserve import TALK, environment, run
 from tests.faults.test_surroundings import fill, mounted
 from tests.support.surroundings import clean_environment
 
@@ -315,22 +315,26 @@ def test_a_search_fails_if_the_disk_does_not_respond_and_finds_unwritten_goals_o
     assert b"door open" in stored_files(str(tmp_path))
 
 
-def test_a_history_of_another_user_is_named_with_its_owner(home: str) -> None:
-    """A directory without permissions stands for another user's, unless root runs the test."""
-    state = f"{home}/.local/state/talk"
-    os.makedirs(state)
-    env = environment(home, TALK_SOCKET=f"{home}/s")
-    socket = f"{home}/s"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("HOME", home)
-        patch.delenv("XDG_STATE_HOME", raising=False)
-        path = paths.history_files(socket)[0]
+@pytest.mark.parametrize("hidden", [False, True])
+def test_a_history_of_another_user_is_named_with_its_owner(
+    home: str, monkeypatch: pytest.MonkeyPatch, *, hidden: bool
+) -> None:
+    """The patches stand for another user's file, and for one in a directory that the user can't enter."""
+    monkeypatch.setenv("XDG_STATE_HOME", home)
+    path = paths.history_files(f"{home}/s")[0]
     HistoryWriter(path).write([])
-    os.chmod(path, 0)
-    command = [*TALK, "log"]
-    if os.getuid() == 0:
-        command = ["setpriv", "--reuid", "65534", "--clear-groups", *command]
-    done = run(command, env)
-    assert done.code == 3
-    assert done.err.startswith(f"talk: no server found; tried:\n  {socket}")
-    assert done.err.endswith(f"the history {path} can't be read: it belongs to uid {os.getuid()}\n")
+    stat = os.stat
+
+    def refuse(name: str, **options: Any) -> os.stat_result:
+        if hidden and name == path:
+            raise PermissionError
+        return stat(name, **options)
+
+    monkeypatch.setattr(os, "stat", refuse)
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    with pytest.raises(ServerUnavailable) as failed:
+        log(CommonOptions(socket=f"{home}/s"), None, long=False)
+    first, *_, last = str(failed.value).splitlines()
+    assert first == "no server found; tried:"
+    owner = stat("/").st_uid if hidden else os.getuid()
+    assert last == f"the history {path} can't be read: it belongs to uid {owner}"
