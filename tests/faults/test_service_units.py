@@ -125,6 +125,28 @@ def test_services_are_supervised_and_the_system_one_admits_group_audio(home: str
     assert "--socket-mode=0666" in command_of(print_unit(home, "system", "--socket-mode", "0666"))
 
 
+@pytest.mark.parametrize(
+    ("name", "options", "last", "directories"),
+    [
+        ("system", ["--history"], "--history", ["talk"]),
+        ("system", ["--history", "no-text"], "--history=no-text", ["talk"]),
+        ("system", [], "--socket-mode=0660", []),
+        ("user", ["--history"], "--history", []),  # the server creates it in the user's state directory
+        ("user", ["--history", "./h.db"], f"--history={os.getcwd()}/h.db", []),
+    ],
+)
+def test_the_system_unit_has_a_directory_for_the_history(
+    home: str, name: str, options: list[str], last: str, directories: list[str]
+) -> None:
+    unit = print_unit(home, name, *options)
+    assert command_of(unit)[-1] == last
+    assert unit_values(unit, "StateDirectory") == directories
+    assert unit_values(unit, "StateDirectoryMode") == ["0700"] * len(directories)
+    if directories:
+        needs("systemd-analyze")
+        assert_valid_unit(home, name, service=unit)
+
+
 @pytest.mark.parametrize("name", ["user", "system"])
 def test_the_command_is_absolute_and_keeps_the_given_options(home: str, name: str) -> None:
     greeting = 'I\'m "here", at 100 % of $HOME \\ now; --really'
