@@ -12,7 +12,7 @@ from talkcli import Client, State
 from talkcli.client.connection import Connection
 from talkcli.client.core import ServerInfo
 from talkcli.client.goal import GoalHandle, merged
-from talkcli.errors import Lost, ServerUnavailable, UsageError
+from talkcli.errors import Lost, ProtocolMismatch, ServerUnavailable, UsageError
 from talkcli.goals.goal import Goal
 from talkcli.goals.options import Cancel, Log, Say
 from talkcli.protocol.events import PausedChanged, Result, StateChanged, from_json
@@ -90,6 +90,18 @@ def test_a_number_means_a_goal_of_the_connected_server(scripted: Scripted) -> No
     client.goal("12")
     client.cancel(["12", "mine"])
     assert scripted.requests == [Status("fake-12"), Cancel(("fake-12", "mine"))]
+
+
+def test_only_a_server_with_filters_is_asked_for_its_history(scripted: Scripted) -> None:
+    client = Client.over(scripted)
+    scripted.server = ServerInfo("fake", features=())  # an older server
+    client.log(5)
+    with pytest.raises(ProtocolMismatch, match="does not support filters of the log; restart it"):
+        client.log(since=1.0)
+    scripted.server = ServerInfo("fake", features=("history",))
+    client.log(5)
+    client.log(since=1.0, history=False)
+    assert scripted.requests == [Log(5), Log(5, history=True), Log(since=1.0)]
 
 
 def test_a_handle_needs_no_client(scripted: Scripted) -> None:
