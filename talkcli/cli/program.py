@@ -14,8 +14,6 @@ from talkcli.terminal.text import printable
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-#: Exit codes of a shell if a program is not found, or can't be started for another reason.
-_EXIT_NOT_FOUND, _EXIT_NOT_STARTED = 127, 126
 _FROM_TERMINAL = {signal.SIGINT, signal.SIGQUIT}
 _HANDLED_SIGNALS = {*_FROM_TERMINAL, signal.SIGTERM, signal.SIGHUP, signal.SIGCHLD}
 
@@ -33,15 +31,13 @@ def run_program(command: Sequence[str]) -> int:
         process = subprocess.Popen(command, preexec_fn=unblock)  # noqa: PLW1509 - this process has no threads
     except OSError as error:
         failed = TalkError(f"can't run '{printable(command[0])}': {error.strerror}")
-        failed.code = "not_started"
-        failed.exit_code = _EXIT_NOT_FOUND if error.errno == errno.ENOENT else _EXIT_NOT_STARTED
+        failed.code, failed.exit_code = "not_started", 127 if error.errno == errno.ENOENT else 126  # as in a shell
         raise failed from None
     while process.poll() is None:
         number, by_system = _wait_for_signal()
         if number != signal.SIGCHLD and not by_system:
             process.send_signal(number)
-    code = process.returncode
-    return EXIT_SIGNAL - code if code < 0 else code
+    return process.returncode if process.returncode >= 0 else EXIT_SIGNAL - process.returncode
 
 
 def _wait_for_signal() -> tuple[int, bool]:
