@@ -117,7 +117,7 @@ class Speak:
     broken: bool = False  # whether the text broke off; an incomplete sentence at its end is not spoken
     pronunciations: dict[str, str] | None = None  # terms of the text with their replacements
     # The next fields describe what was heard before the goal was interrupted.
-    start: int = 0  # offset in the text at which the speech begins
+    start: int = 0  # offset in the text at which the speech begins, or the number of samples of a sound to skip
     heard_end: int = 0  # offset of the end of the last word that was reported
     heard_words: int = 0  # number of words that were reported
     heard: float = 0.0  # seconds of audio that were heard
@@ -357,7 +357,7 @@ class Ended:
     gap_seconds: float = 0.0  # total length of the silent gaps, in seconds
     player: str | None = None  # the player that worked last, if it was chosen automatically
     heard: float | None = None  # seconds of the audio that were heard; None if unknown
-    rest: int | None = None  # offset at which the text continues; None unless the goal was interrupted
+    rest: int | None = None  # the `start` of the `Speak` that continues the goal; None unless it was interrupted
 
 
 #: Commands that start a goal. There is one for each kind of goal.

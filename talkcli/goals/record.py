@@ -73,7 +73,7 @@ class Record:
     paused: bool = False
     #: id of the goal that interrupts this one, or None
     interrupted_by: str | None = None
-    #: offset in the text at which the speech continues after the last interruption, or 0
+    #: where the goal continues after the last interruption: an offset in the text, or a number of samples of a sound
     rest: int = 0
     #: number of words that have started
     word_count: int = 0

@@ -957,12 +957,12 @@ class Scheduler:
     def _interrupt_active(self) -> list[Effect]:
         """Interrupt the active goal if an interjection is waiting for that. Return the order, if any.
 
-        Another interjection is only interrupted by one with a higher priority. Sounds are never interrupted.
+        Another interjection is only interrupted by one with a higher priority.
         """
         active = self.active
         if active is None or active.state is not State.ACTIVE or self.paused or self._interrupter is not None:
             return []
-        if not self._can_interrupt or active.say.is_sound or len(self.interrupted) >= MAX_INTERRUPTED:
+        if not self._can_interrupt or len(self.interrupted) >= MAX_INTERRUPTED:
             return []
         interjection = self._find_interjection(active.say.priority + active.say.interject)
         if interjection is None:

@@ -257,7 +257,7 @@ class Speech:
         self._announced_next = next_waits, next_is_neural = self._describe_next()
         assert record.settings
         options = engine_options(record.say, record.settings)
-        if record.begun_end:
+        if record.was_heard:
             options |= {"voice": record.voice or options["voice"], "lead_in": None}
         if not is_neural(options["voice"] or ""):
             options["voice_only"] = False

@@ -162,8 +162,8 @@ class Engine:
             protocol.Speak(goal, text, rate, 1.0, voice, pitch, next_waits, lead_in=lead_in, voice_only=voice_only)
         )
 
-    def play(self, sound: str, goal: str = "g1", *, volume: float = 1.0) -> None:
-        self.send(protocol.Speak(goal, sound, USUAL, volume, None, 50, format=SOUND))
+    def play(self, sound: str, goal: str = "g1", *, volume: float = 1.0, **fields: Any) -> None:
+        self.send(protocol.Speak(goal, sound, USUAL, volume, None, 50, format=SOUND, **fields))
 
     def pause(self, goal: str = "g1") -> float:
         """Pause the sentence, and return the seconds until the process confirmed silence."""

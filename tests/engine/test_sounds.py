@@ -108,6 +108,37 @@ def test_a_pause_loses_and_repeats_no_sample(player: Player, tmp_path: Path) -> 
     assert heard[len(exact) :].strip(b"\0") == b""
 
 
+def test_an_interrupted_sound_continues_with_the_next_sample(player: Player, tmp_path: Path) -> None:
+    samples = noise(2.5)
+    (tmp_path / "a.wav").write_bytes(wav(samples / 32_767, RATE))
+    exact = np.fromfile(tmp_path / "a.wav", "<i2")[-len(samples) :]
+    with Engine(player.plays(), sounds=str(tmp_path), alive_every=0.1) as engine:
+        started(engine).play("a")
+        engine.until(protocol.Alive)
+        engine.send(protocol.Interrupt("g1"))
+        ended = engine.until(protocol.Ended)
+        assert ended.outcome == protocol.OUTCOME_INTERRUPTED
+        first = np.fromfile(player.heard, "<i2")
+        assert ended.rest is not None
+        assert np.array_equal(first[: ended.rest], exact[: ended.rest])
+        assert 0 < len(first) - ended.rest <= 0.005 * RATE  # the sound fades out, and the faded part is repeated
+        assert first[-1] == 0
+        duration = completed(engine, "a", start=ended.rest, heard=ended.heard)
+    assert duration == pytest.approx(2.5, abs=0.02)
+    rest = np.fromfile(player.heard, "<i2")[len(first) :]
+    assert np.array_equal(rest[: len(exact) - ended.rest], exact[ended.rest :])
+
+
+@pytest.mark.parametrize("seconds", [0.14, 0.5])
+def test_a_short_sound_ends_before_an_interruption(tmp_path: Path, seconds: float) -> None:
+    write_tone(tmp_path / "a.wav", seconds, RATE)
+    with Engine(sounds=str(tmp_path), alive_every=0.05) as engine:
+        started(engine).play("a")
+        engine.until(protocol.Alive)
+        engine.send(protocol.Interrupt("g1"))
+        assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
+
+
 @limits()
 def test_a_sound_stops_at_once(player: Player, tmp_path: Path) -> None:
     write_tone(tmp_path / "a.wav", 30, 48_000, channels=2, bits=24)

@@ -18,6 +18,8 @@ interrupts the active goal at the end of its word
     a; b interject -> a ACTIVE; b PENDING
 is spoken once the goal has reached the end of its word
     a; b; c interject; interrupted a -> c ACTIVE; a ACTIVE paused for c; b PENDING
+interrupts a sound, too
+    a format=sound; b interject format=sound; interrupted a -> b ACTIVE; a ACTIVE paused for b
 is next if only the last word of the goal was left
     a; b; c interject; completed a -> c ACTIVE; b PENDING; a SUCCEEDED
 lets the goal continue before the queue

@@ -58,10 +58,12 @@ def play_sound(library: SoundLibrary, command: Speak, playback: Playback, requir
         rate, pieces = (file.rate, _read_samples(file)) if file else (DEFAULT_RATE_HZ, _make_tones(command.text))
         player_rate = required_rate or rate * math.ceil(_MIN_PLAYER_RATE / rate)
         playback.begin_sound(player_rate)
-        count = 0
+        skipped, count = command.start, 0  # the samples before an interruption are skipped
         for piece in pieces if player_rate == rate else resample(pieces, rate, player_rate):
-            count += len(piece)
-            samples = piece if command.volume == 1 else array("h", [int(each * command.volume) for each in piece])
+            rest = piece[skipped:]
+            skipped -= len(piece) - len(rest)
+            count += len(rest)
+            samples = rest if command.volume == 1 else array("h", [int(each * command.volume) for each in rest])
             playback.write(samples.tobytes())
         playback.write(bytes(int(_PAUSE_S * player_rate) * SAMPLE_BYTES))
     finally:

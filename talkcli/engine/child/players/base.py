@@ -43,7 +43,7 @@ class EndedEarly(Exception):
     """Raised if an `Interrupt` ends the sentence.
 
     Args:
-        rest: The offset at which the text continues, or None to repeat the last word that was heard.
+        rest: The `start` of the `Speak` that continues the goal, or None to repeat the last word that was heard.
     """
 
     def __init__(self, rest: int | None = None) -> None:
