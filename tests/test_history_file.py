@@ -60,13 +60,16 @@ def test_goals_are_deleted_after_90_days(path: str, writer: HistoryWriter) -> No
 def test_a_full_file_keeps_its_size_and_the_newest_goals(
     path: str, writer: HistoryWriter, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(file, "MAX_CONTENT_BYTES", 1_000_000)
-    for batch in range(40):
-        writer.write([goal(batch * 100 + number, "x" * 500) for number in range(100)])
-        assert sum(os.stat(f"{path}{suffix}").st_size for suffix in ("", "-wal")) < 3_500_000
-    ids = [int(each.partition("-")[2]) for each in stored(path)]
-    assert ids == list(range(4_000))[-len(ids) :]
-    assert 1_000 < len(ids) < 2_000
+    """Long texts follow on short ones, so more than a few short ones must be deleted."""
+    monkeypatch.setattr(file, "MAX_CONTENT_BYTES", 2_000_000)
+    texts = ["x" * 500] * 4_000 + ["\N{ROBOT FACE}" * 10_000] * 80
+    for first in range(0, len(texts), 20):
+        writer.write([goal(number, texts[number]) for number in range(first, first + 20)])
+        assert os.stat(path).st_size < 2_000_000
+        if first % 400 == 0:
+            ids = [int(each.partition("-")[2]) for each in stored(path)]
+            assert ids == list(range(first + 20 - len(ids), first + 20))
+            assert len(ids) >= min(first + 20, 40)
 
 
 def test_a_removed_file_is_created_again(path: str, writer: HistoryWriter) -> None:

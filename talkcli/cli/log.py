@@ -82,8 +82,7 @@ def _read_history(options: CommonOptions, request: Log, error: ServerUnavailable
         from talkcli.history.file import search
         from talkcli.history.rows import given_filters, row_to_json, sql_condition
 
-        end = time.monotonic() + _SEARCH_LIMIT_S
-        rows = search(path, *sql_condition(given_filters(request)), request.count, end)
+        rows = search(path, *sql_condition(given_filters(request)), request.count, time.monotonic() + _SEARCH_LIMIT_S)
     except (ImportError, TalkError) as failure:  # ImportError if this Python has no sqlite3
         raise ServerUnavailable(f"{error.message}\nthe history {path} can't be read: {failure}") from failure
     if not options.quiet:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from talkcli.errors import TalkError
-from talkcli.history.rows import COLUMNS, SCHEMA, to_row
+from talkcli.history.rows import COLUMNS, SCHEMA, row_chars, to_row
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,19 +27,20 @@ if TYPE_CHECKING:
 
 #: Goals that ended longer ago than this are deleted.
 MAX_AGE_S = 90 * 24 * 3600.0
-#: If the goals and their indexes are larger than this, the oldest goals are deleted. The file and its write-ahead log
-#: (WAL) need a few more megabytes while goals are written and deleted, but together at most 64 MB.
+#: Maximum size of the goals and their indexes. Together with the write-ahead log (WAL), the file has at most 64 MB.
 MAX_CONTENT_BYTES = 56_000_000
 #: Maximum size of the WAL. It can't be emptied while another program reads the file.
 MAX_WAL_BYTES = 7_000_000
 #: How long to wait while another process writes to the file.
 _LOCK_WAIT_S = 2.0
 #: With NORMAL, a crash of the server loses no written goal, and a power failure only the newest ones. Deleted texts are
-#: overwritten.
+#: overwritten if this needs no further writing.
 _PRAGMAS = """
-PRAGMA journal_mode = WAL; PRAGMA synchronous = NORMAL; PRAGMA secure_delete = ON;
+PRAGMA journal_mode = WAL; PRAGMA synchronous = NORMAL; PRAGMA secure_delete = FAST;
 PRAGMA wal_autocheckpoint = 256; PRAGMA journal_size_limit = 1048576;
 """
+#: Returns the size of the used pages. A page has 4,096 bytes, which is SQLite's default.
+_CONTENT_BYTES = "SELECT (page_count - freelist_count) * 4096 FROM pragma_page_count, pragma_freelist_count"
 #: Deletes the oldest 5 % of the goals.
 _DELETE_OLDEST = """
 DELETE FROM goals WHERE number <=
@@ -124,12 +125,12 @@ class HistoryWriter:
             raise OSError("another program has been reading the file for too long")
         connection.execute("BEGIN IMMEDIATE")
         connection.execute("DELETE FROM goals WHERE ended_at < ?", (time.time() - MAX_AGE_S,))
-        sizes = [connection.execute(f"PRAGMA {each}") for each in ("page_count", "freelist_count", "page_size")]
-        pages, free, page_bytes = (each.fetchone()[0] for each in sizes)
-        if (pages - free) * page_bytes > MAX_CONTENT_BYTES:
-            connection.execute(_DELETE_OLDEST)
-        # SQLite releases the interpreter after each row, so other threads needn't wait until all rows are converted.
-        connection.executemany(_INSERT, map(to_row, goals))
+        rows = list(map(to_row, goals))
+        added_bytes = 4 * sum(map(row_chars, rows))  # a character has at most four bytes
+        while connection.execute(_CONTENT_BYTES).fetchone()[0] + added_bytes > MAX_CONTENT_BYTES:
+            if connection.execute(_DELETE_OLDEST).rowcount == 0:
+                break
+        connection.executemany(_INSERT, rows)
         connection.execute("COMMIT")
         return message
 
