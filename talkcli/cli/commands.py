@@ -70,14 +70,8 @@ def _say_options() -> Iterator[Option]:
 
 _SAY_OPTIONS = tuple(_say_options())
 #: Options of `say` that can be combined with --output.
-_SERVERLESS_OPTIONS = {
-    "timeout",
-    "output",
-    "pronounce",
-    "format",
-    "dry_run",
-    *(each.name for each in goal_options.SOUND_OPTIONS),
-}
+_SERVERLESS_OPTIONS = {"timeout", "output", "pronounce", "format", "dry_run"}
+_SERVERLESS_OPTIONS |= {each.name for each in goal_options.SOUND_OPTIONS}
 #: File extensions of audio formats other than WAV.
 _OTHER_EXTENSIONS = (".aac", ".aiff", ".au", ".flac", ".m4a", ".mp3", ".mp4", ".oga", ".ogg", ".opus", ".webm", ".wma")
 
@@ -151,6 +145,7 @@ def _play_fault(values: Mapping[str, Any], typed: frozenset[str]) -> str | None:
     return _goal_fault(values)
 
 
+_PRONOUNCE_HELP = "Say words as FILE defines. It has lines such as: GmbH = gay em bay ha. A changed file is read again."
 _SERVE_OPTIONS = (
     *(each.for_serve() for each in goal_options.SETTINGS),
     # At two seconds per sentence, 100 goals are more than three minutes of speech. Searching a queue of the maximum
@@ -211,13 +206,7 @@ _SERVE_OPTIONS = (
         metavar="[no-text|FILE]",
         bare_value=TEXT_HISTORY,
     ),
-    option(
-        "--pronounce",
-        PATH,
-        "Say words as FILE defines. It has lines such as 'GmbH = gay em bay ha'. A changed file is read again.",
-        metavar="FILE",
-        completion="files",
-    ),
+    option("--pronounce", PATH, _PRONOUNCE_HELP, metavar="FILE", completion="files"),
     option("--socket-mode", FILE_MODE, "Set the socket's file mode, which decides who may connect.", default="0600"),
     option("--greeting", TEXT, "Speak this sentence when the server starts."),
     _print_unit_option("user", "system", "user-socket", "system-socket"),

@@ -154,16 +154,13 @@ def run(parsed: PlainCommand) -> int:
 def may_send_early(parsed: PlainCommand) -> bool:
     """Return whether the request may be sent before the rest of the program is imported.
 
-    The command must use the local server, and must not need standard input, which may take any time to arrive. Dry runs
-    have time.
+    The command must use the local server, and must not need standard input, which may take any time to arrive. The
+    library sends lists of sounds and dry runs.
     """
     if named_robot(parsed.common.get("robot"), parsed.common.get("socket")):
         return False
-    given = parsed.given
-    if given.get("dry_run"):
-        return False
-    reads_input = given.get("lines") or given.get("stream") or given.get("text") == ("-",) or given.get("list")
-    return parsed.command.name in _EARLY_COMMANDS and not reads_input
+    takes_time = [parsed.given.get(each) for each in ("lines", "stream", "list", "dry_run")]
+    return parsed.command.name in _EARLY_COMMANDS and not any(takes_time) and parsed.given.get("text") != ("-",)
 
 
 def _connect_early(parsed: PlainCommand, before_sending: Callable[[], None]) -> ConnectionAttempt | None:

@@ -29,12 +29,11 @@ from talkcli.polling import Interrupted
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
     from typing import Any
 
     from talkcli.cli.show import CommonOptions
     from talkcli.client.client import GoalHandle
-    from talkcli.engine.pronunciation import Pronunciations
 
 
 def say(
@@ -88,8 +87,8 @@ def say(
         return found  # nothing can be spoken
     sentence = replace_and_report_bad_bytes(found, options)
     if output is not None or dry_run:
-        act = _print_dry_run if dry_run else _write_wav_file
-        return act(output or "", sentence, goal_options, timeout, options, pronounce)
+        goal_options |= {"pronounce": pronounce, "dry_run": dry_run}
+        return _run_without_goal(output, sentence, goal_options, timeout, options)
     with Interrupts(blocked=options.blocked_signals, output=wait) as interrupts:
         try:
             with options.connect(timeout, name=name, interrupt=interrupts.watched) as client:
@@ -162,77 +161,52 @@ def _report_sent(goal: GoalHandle, options: CommonOptions, reporter: GoalReporte
     return reporter.report(goal.goal)
 
 
-def _print_dry_run(
-    path: str,
-    text: str,
-    goal_options: Mapping[str, Any],
-    timeout: float | None,
-    options: CommonOptions,
-    pronounce: str | None,
+def _run_without_goal(
+    path: str | None, text: str, values: dict[str, Any], timeout: float | None, options: CommonOptions
 ) -> int:
-    """Print a text as it would be said, or why it would be rejected. Return the exit code.
+    """Write a text's speech to a file, or print the text as it would be said. Return the exit code.
 
-    The server is asked, unless the text would be written to a file.
+    A dry run with a file renders the text, but writes nothing. A dry run without one asks the server.
     """
-    if path:
-        from talkcli.engine.parent.render import check_text
-
-        check_text(text, timeout=seconds_left(options.deadline(timeout)), **_sound_settings(goal_options))
-        text_format = goal_options["format"]
-        said = _read_pronunciations(pronounce, options).apply_to_goal(text, text_format).for_people(text_format)
-        goal = Goal("", State.PENDING, text, format=text_format, said=None if said == text else said)
-    else:
+    pronounce, dry_run = values.pop("pronounce"), values.pop("dry_run")
+    if path is None:
         with options.connect(timeout) as client:
-            goal = client.dry_run(text, **goal_options)
+            goal = client.dry_run(text, **values)
         if goal.state is State.REJECTED:
             return GoalReporter(options, feedback=False).report_refused(goal)
-    said = goal.text or "" if goal.said is None else goal.said
+    else:
+        from talkcli.engine.pronunciation import PronunciationFile, Pronunciations
+
+        report: Callable[[str], None] = (lambda _: None) if options.quiet else note
+        table = PronunciationFile(pronounce, report).refresh() if pronounce else Pronunciations({})
+        values["pronunciations"] = table.terms
+        code = _write_wav_file(os.devnull if dry_run else path, text, values, timeout, options)
+        if code or not dry_run:
+            return code
+        goal = Goal("", State.PENDING, text, format=values["format"], said=table.say(text, values["format"]))
+    said = str(goal.text if goal.said is None else goal.said)
     show_result(options, [goal.to_json()], lambda: map(printable, said.splitlines()))
     return EXIT_OK
 
 
-def _read_pronunciations(path: str | None, options: CommonOptions) -> Pronunciations:
-    """Read a file of pronunciations, if there is one. Print a message about each faulty line."""
-    from talkcli.engine.pronunciation import PronunciationFile, Pronunciations
-
-    file = PronunciationFile(path) if path else None
-    for fault in file.describe_faults() if file and not options.quiet else ():
-        note(printable(fault))
-    return file.table if file else Pronunciations({})
-
-
 def _write_wav_file(
-    path: str,
-    text: str,
-    goal_options: Mapping[str, Any],
-    timeout: float | None,
-    options: CommonOptions,
-    pronounce: str | None,
+    path: str, text: str, values: Mapping[str, Any], timeout: float | None, options: CommonOptions
 ) -> int:
     """Write a text's speech to a WAV file, or to standard output for "-". Return the exit code."""
     from talkcli.engine.parent.render import STANDARD_OUTPUT, render
 
-    settings, seconds_at_most = _sound_settings(goal_options), seconds_left(options.deadline(timeout))
-    markdown = goal_options["format"] == MARKDOWN
+    settings, seconds_at_most = _sound_settings(values), seconds_left(options.deadline(timeout))
+    more = {"markdown": values["format"] == MARKDOWN, "pronunciations": values["pronunciations"]}
     if path in STANDARD_OUTPUT:
         if options.json:
             raise UsageError("--json and -o - both write to standard output; leave out one of them")
         standard_output()
-    pronunciations = _read_pronunciations(pronounce, options)
     with Interrupts() as interrupts:
         try:
-            seconds = render(
-                text,
-                path,
-                timeout=seconds_at_most,
-                interrupt=interrupts.watched,
-                markdown=markdown,
-                pronunciations=pronunciations,
-                **settings,
-            )
+            seconds = render(text, path, timeout=seconds_at_most, interrupt=interrupts.watched, **more, **settings)
         except Interrupted:
             return interrupts.exit_code
-    if options.json:
+    if options.json and path != os.devnull:
         result = {"output": path, "seconds": seconds, "text": text, **settings}
         retry_without_output(show_if_possible, show_json, result)  # the file has been written, even if this fails
     return EXIT_OK

@@ -54,7 +54,6 @@ _HIDDEN_PATH_ADVICE = {
     "--history": "leave out the path, so that the history is in /var/lib/talk",
     "--player file:": "choose a file in /run/talk",
 }
-_WRITING_OPTIONS = ("--history", "--player file:")
 _LET_READ = "copy it into /etc/talk, and let everybody read it"
 
 
@@ -182,12 +181,11 @@ def _print_unit(
     show(unit.rstrip("\n"))
     if kind != "system":
         return EXIT_OK
-    named = {long_flag(each): given[each.name] for each in row.options if each.kind is PATH}
     player, colon, file = (given.get("player") or "").partition("file:")
+    named = {long_flag(each): given[each.name] for each in row.options if each.kind is PATH}
     named |= {"--socket": socket, "--player file:": colon and os.path.abspath(file), "--player": player.split(" ")[0]}
     for flag, path in named.items():
-        problem = _find_hidden_path(flag, path or "", hides_home=home == "yes")
-        if problem:
+        if path and os.path.isabs(path) and (problem := _find_hidden_path(flag, path, hides_home=home == "yes")):
             note(f"{flag} names {printable(path)}, but {problem}; {_HIDDEN_PATH_ADVICE.get(flag, _LET_READ)}")
     if hidden := _find_inaccessible_file(files):
         file, directory = hidden
@@ -224,19 +222,19 @@ def _find_hidden_path(flag: str, path: str, *, hides_home: bool) -> str | None:
 
     Args:
         flag: the option.
-        path: its value. Only absolute paths are checked.
+        path: the absolute path.
         hides_home: whether the unit hides home directories.
     """
     if path.startswith(("/tmp/", "/var/tmp/")):
         return "the service has a /tmp of its own (PrivateTmp=)"
     if hides_home and path.startswith(_HOME_DIRECTORIES):
         return "the unit hides home directories (ProtectHome=)"
-    if flag in _WRITING_OPTIONS and path.startswith("/") and not path.startswith(_WRITABLE_DIRECTORIES):
-        return "the service can't write there (ProtectSystem=)"
-    if flag not in _HIDDEN_PATH_ADVICE and path.startswith("/") and os.path.exists(path):
-        needed = stat.S_IROTH | (stat.S_IXOTH if os.path.isdir(path) else 0)
-        if _find_inaccessible_file([path]) or os.stat(path).st_mode & needed != needed:
-            return "the service's user can't read it (DynamicUser=)"
+    if flag in ("--history", "--player file:"):
+        return None if path.startswith(_WRITABLE_DIRECTORIES) else "the service can't write there (ProtectSystem=)"
+    inside = os.path.join(path, "") if os.path.isdir(path) else path
+    is_readable = not os.path.exists(path) or os.stat(path).st_mode & stat.S_IROTH
+    if flag != "--socket" and not (is_readable and _find_inaccessible_file([inside]) is None):
+        return "the service's user can't read it (DynamicUser=)"
     return None
 
 
@@ -246,7 +244,7 @@ def _find_inaccessible_file(files: Sequence[str]) -> tuple[str, str] | None:
         steps = path.split(os.sep)
         for count in range(2, len(steps)):
             directory = os.sep.join(steps[:count])
-            if not os.stat(directory).st_mode & stat.S_IXOTH:
+            if os.path.exists(directory) and not os.stat(directory).st_mode & stat.S_IXOTH:
                 return path, directory
     return None
 

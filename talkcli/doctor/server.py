@@ -293,15 +293,10 @@ def _judge_pronunciations(found: object) -> list[Finding]:
     """Check the file of pronunciations. Return the finding, or nothing if the server was started without a file."""
     if not isinstance(found, dict):
         return []
-    path, faults = found.get("file"), found.get("faults")
-    words = f"{found.get('terms')} terms from {path}"
-    if found.get("problem"):
-        words += f"; the file {found['problem']}"
-        return [warning("pronunciation", words, "put the file back, and let the server's user read it")]
-    if isinstance(faults, list) and faults:
-        step = f"correct {path}; the server reads it again before the next sentence"
-        return [warning("pronunciation", "; ".join([words, *map(str, faults)]), step)]
-    return [ok("pronunciation", words)]
+    problems = [str(each) for each in found["problems"]]
+    words = "; ".join(["{terms} terms from {file}".format(**found), *problems])
+    step = "correct the file, and let the server's user read it; it is read again before the next sentence"
+    return [warning("pronunciation", words, step) if problems else ok("pronunciation", words)]
 
 
 def _judge_history(history: object) -> list[Finding]:

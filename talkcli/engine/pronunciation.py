@@ -14,43 +14,35 @@ import bisect
 import os
 import re
 import stat
-import unicodedata
-from functools import lru_cache
 
 from talkcli.errors import UsageError
 from talkcli.frozen import TYPE_CHECKING
 from talkcli.goals.options import MARKDOWN, MAX_TEXT_CHARS, is_visible
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator
 
     from talkcli.goals.goal import JsonObject
 
-    #: a term and its place in a text: start, end, the term as it is in the file, and its replacement
-    Match = tuple[int, int, str, str]
-
-#: The maximum size of a file of pronunciations, which has room for thousands of terms.
-MAX_FILE_BYTES = 64 * 1024
-#: The maximum length of a term and of its replacement. Longer phonemes could overrun a buffer of libespeak-ng.
-_MAX_TERM_CHARS, _MAX_REPLACEMENT_CHARS = 100, 200
-#: How many characters the replacements may add to a text. After that, terms are spoken as they are.
-_MAX_ADDED_CHARS = MAX_TEXT_CHARS
-#: The maximum number of faulty lines to list.
-_MAX_SHOWN_FAULTS = 10
+#: The maximum size of a file of pronunciations, which has room for about two thousand terms.
+MAX_FILE_BYTES = 32 * 1024
+#: The maximum length of a line.
+_MAX_LINE_CHARS = 200
+#: The maximum number of faulty lines to name.
+_MAX_NAMED_FAULTS = 10
 
 #: Matches plain text and phonemes. Phonemes are ASCII, and libespeak-ng needs room for at most 60 of them in a word.
 _REPLACEMENT = re.compile(r"(?:[^\[\]]|\[\[[ -Z\\^-~]{1,60}\]\])+")
 _PHONEMES = re.compile(r"\[\[[^\]]*\]\]")
-#: A place where a term may begin: a word, or any other visible character. Scripts without blanks between words begin
-#: at U+2E80. Each of their characters is a place of its own.
-_CHUNK = re.compile(r"[^\W\u2e80-\U0010ffff]+|\S")
-_FIRST_UNSPACED = "\u2e80"
+_UNSPEAKABLE = re.compile("[\0-\b\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
+#: A letter, a digit or an accent in a script that separates words with blanks. Other scripts begin at U+2E80.
+_LETTER = r"(?:[^\W\u2e80-\U0010ffff]|[\u0300-\u036f])"
+#: A place where a word may begin or end. Numbers such as "2.5" count as one word.
+_BORDER = rf"(?:(?<!{_LETTER})|(?!{_LETTER}))(?!(?<=\d)[.,:]\d)(?<!\d[.,:](?=\d))"
+#: A word, or any other visible character, with which a term may begin
+_FIRST_WORD = re.compile(rf"{_LETTER}+|\S")
 #: A blank between two words of a term, which is not the end of a paragraph.
 _GAP = r"(?:(?!\n\s*\n)\s)+"
-#: The marks that stand for a pause in Markdown, and the usual marks outside Chinese and Japanese.
-_PAUSES = {"。": ". ", "，": ", "}
-_PAUSE_MARK = re.compile(r"\s*([。，])")
-_NUMBER_MARK = re.compile(r"\d[.,:]\d")
 #: In a text with phonemes, the sender's brackets become parentheses, which sound the same.
 _WITHOUT_BRACKETS = str.maketrans("[]", "()")
 
@@ -63,25 +55,26 @@ class SpokenText:
         end: the offset after the part in the text that was sent. It may be greater than requested, because no term is
             cut in two.
         has_phonemes: whether `[[` and `]]` enclose phonemes.
-        replaced: the terms that were replaced, with their replacements.
     """
 
-    def __init__(self, text: str, start: int, end: int, matches: list[Match]) -> None:
-        """Replace terms in the part of a text from `start` to `end`."""
-        self.end = max(end, matches[-1][1]) if matches else end
-        self.has_phonemes = any("[[" in replacement for _, _, _, replacement in matches)
-        self.replaced = {term: replacement for _, _, term, replacement in matches}
+    def __init__(self, text: str, start: int, end: int, replacements: list[tuple[int, int, str]]) -> None:
+        """Replace terms in the part of a text from `start` to `end`.
+
+        `replacements` has the start, the end and the replacement of each term.
+        """
+        self.has_phonemes = any("[[" in each for _, _, each in replacements)
         #: for each section of the new text: where it begins there and in the text that was sent, and the length of the
         #: term that it replaces, or 0
         self._sections: list[tuple[int, int, int]] = []
         self._last_term = -1
-        self.text, at = "", start
+        self.text, self.end = "", start
         kept = text.translate(_WITHOUT_BRACKETS) if self.has_phonemes else text
-        for begin, term_end, _, replacement in matches:
-            self._append(kept[at:begin], at, 0)
-            self._append(replacement, begin, term_end - begin)
-            at = term_end
-        self._append(kept[at : self.end], at, 0)
+        for term_start, term_end, replacement in replacements:
+            self._append(kept[self.end : term_start], self.end, 0)
+            self._append(replacement, term_start, term_end - term_start)
+            self.end = term_end
+        self._append(kept[self.end : end], self.end, 0)
+        self.end = max(self.end, end)
 
     def _append(self, text: str, start: int, term_chars: int) -> None:
         """Append a section, which begins at the offset `start` in the sent text.
@@ -89,8 +82,8 @@ class SpokenText:
         Phonemes are separated by blanks. Otherwise, libespeak-ng ignores phonemes after a bracket, and a hyphen after
         phonemes crashes Vietnamese voices.
         """
-        meets_phonemes = self.has_phonemes and (self.text.endswith("]]") or text.startswith("[["))
-        if meets_phonemes and not (self.text[-1:].isspace() or text[:1].isspace()) and self.text and text:
+        before, after = self.text[-1:].strip(), text[:1].strip()
+        if before and after and self.has_phonemes and (before == "]" or after == "["):
             self.text += " "
         self._sections.append((len(self.text), start, term_chars))
         self.text += text
@@ -100,133 +93,86 @@ class SpokenText:
 
         A replaced term is located only once, even if it is spoken as several words. After that, return None.
         """
-        section, begin = self._map(start)
-        _, original, term_chars = self._sections[section]
-        if not term_chars:
-            last, end = self._map(start + length - 1)
-            _, original, term_chars = self._sections[last]
-            return begin, (original + term_chars if term_chars else end + 1) - begin
-        if section == self._last_term:
-            return None
-        self._last_term = section
-        return original, term_chars
+        section = self._find_section(start)
+        begin, original, term_chars = self._sections[section]
+        if term_chars:
+            is_new, self._last_term = section != self._last_term, section
+            return (original, term_chars) if is_new else None
+        place, last = original + start - begin, start + length - 1
+        begin, original, term_chars = self._sections[self._find_section(last)]
+        return place, original + (term_chars or last - begin + 1) - place
 
-    def for_people(self, text_format: str) -> str:
-        """Return the spoken text for people to read. The marks of Markdown leave no blanks and no wide punctuation."""
-        if text_format != MARKDOWN:
-            return self.text
-        narrow = _PAUSE_MARK.sub(lambda found: _PAUSES[found[1]], self.text)
-        return " ".join((self.text if max(narrow, default="") >= _FIRST_UNSPACED else narrow).split())
-
-    def _map(self, place: int) -> tuple[int, int]:
-        """Find an offset of the spoken text. Return its section, and the matching offset in the sent text.
-
-        In a replaced term, only the section is valid.
-        """
-        section = max(0, bisect.bisect_right(self._sections, place, key=lambda each: each[0]) - 1)
-        begin, original, _ = self._sections[section]
-        return section, original + place - begin
+    def _find_section(self, place: int) -> int:
+        """Return the index of the section that contains an offset of the spoken text."""
+        return max(0, bisect.bisect_right(self._sections, place, key=lambda each: each[0]) - 1)
 
 
 class Pronunciations:
     """A table of terms with their replacements."""
 
-    def __init__(self, terms: Mapping[str, str]) -> None:
+    def __init__(self, terms: dict[str, str]) -> None:
         self.terms = terms
-        #: the terms by their first chunk in lower case. The longest term comes first, and its exact case before others.
-        self._by_chunk: dict[str, list[tuple[str, str]]] = {}
-        for term in sorted(terms, key=lambda each: (-len(each), each == each.lower())):
-            for form in dict.fromkeys((term, *(unicodedata.normalize(each, term) for each in ("NFC", "NFD")))):
-                first = _CHUNK.match(form)
-                assert first
-                self._by_chunk.setdefault(first.group().lower(), []).append((form, term))
+        ordered = sorted(terms, key=lambda each: (-len(each), each == each.lower()))
+        #: the terms in the order in which they are tried, with their first words in lower case
+        self._first_words = {each: _FIRST_WORD.findall(each)[0].lower() for each in ordered}
 
     def apply(self, text: str, start: int = 0, end: int | None = None) -> SpokenText:
         """Return a text, or its part from `start` to `end`, with all terms replaced."""
         end = len(text) if end is None else end
-        return SpokenText(text, start, end, list(self._find(text, start, end)))
+        replacements, added = [], 0
+        for found, term in self._find(text, start):
+            if found.start() >= end or added > MAX_TEXT_CHARS:  # after that, terms are spoken as they are
+                break
+            added += len(self.terms[term])
+            replacements.append((*found.span(), self.terms[term]))
+        return SpokenText(text, start, end, replacements)
 
-    def apply_to_goal(self, text: str, text_format: str) -> SpokenText:
-        """Replace the terms in a goal's text, without the marks of Markdown."""
+    def _find(self, text: str, start: int) -> Iterator[tuple[re.Match[str], str]]:
+        """Yield each match of a term after an offset, with the term."""
+        # A regular expression for all terms would take seconds for a long text.
+        words = {each.lower() for each in _FIRST_WORD.findall(text, start)} if self.terms else set()
+        terms = [term for term, first_word in self._first_words.items() if first_word in words]
+        pattern = re.compile(f"{_BORDER}(?:{'|'.join(map(_group_for, terms))}){_BORDER}")
+        for found in pattern.finditer(text, start) if terms else ():
+            yield found, terms[(found.lastindex or 0) - 1]
+
+    def say(self, text: str, text_format: str) -> str | None:
+        """Return a goal's text as it is said, for people to read. Return None if it is said as it was sent."""
         if text_format == MARKDOWN:
             from talkcli.engine.markdown import blank_markdown  # rarely needed, and slow to import
 
-            text = blank_markdown(text)
-        return self.apply(text)
-
-    def _find(self, text: str, start: int, end: int) -> Iterator[Match]:
-        """Yield each term that begins in a part of a text, with its place and its replacement."""
-        at, added = start, 0
-        for chunk in _CHUNK.finditer(text, start) if self.terms else ():
-            begin = chunk.start()
-            if begin >= end or added > _MAX_ADDED_CHARS:
-                return
-            for form, term in self._by_chunk.get(chunk.group().lower(), ()) if begin >= at else ():
-                found = _compile(form).match(text, begin)
-                if found and _is_border(text, begin) and _is_border(text, found.end()):
-                    at = found.end()
-                    added += len(self.terms[term])
-                    yield begin, at, term, self.terms[term]
-                    break
+            said = " ".join(self.apply(blank_markdown(text)).text.split())
+        else:
+            said = self.apply(text).text
+        return None if said == text else said
 
 
-@lru_cache(1_000)
-def _compile(term: str) -> re.Pattern[str]:
-    """Return a regular expression for a term. Compiling all terms of a file would take too long."""
-    return re.compile(_GAP.join(map(re.escape, term.split())), re.IGNORECASE if term == term.lower() else 0)
+def _group_for(term: str) -> str:
+    """Return a group of a regular expression that matches a term."""
+    words = _GAP.join(map(re.escape, term.split()))
+    return f"((?i:{words}))" if term == term.lower() else f"({words})"
 
 
-def _is_border(text: str, at: int) -> bool:
-    """Return whether a word may begin or end at an offset. Numbers such as "2.5" count as one word."""
-    if any(at >= back and _NUMBER_MARK.match(text, at - back) for back in (1, 2)):
-        return False
-    return not (_is_word_character(text[max(0, at - 1) : at]) and _is_word_character(text[at : at + 1]))
-
-
-def _is_word_character(character: str) -> bool:
-    """Return whether a character belongs to a word, in a script that separates words with blanks."""
-    if not character or character >= _FIRST_UNSPACED:
-        return False
-    return character.isalnum() or character in "_\u200c\u200d" or unicodedata.category(character).startswith("M")
-
-
-def parse_pronunciations(data: bytes, *, phonemes: bool = True) -> tuple[dict[str, str], list[str]]:
-    """Parse a file of pronunciations. Return the terms, and a message about each faulty line.
-
-    If `phonemes` is false, lines with phonemes are faulty, because the driver doesn't support them.
-    """
+def parse_pronunciations(data: bytes) -> tuple[dict[str, str], list[str]]:
+    """Parse a file of pronunciations. Return the terms, and a message about each faulty line."""
     terms: dict[str, str] = {}
-    lines: dict[str, int] = {}
     faults = []
     for number, line in enumerate(data.decode("utf-8-sig", "surrogateescape").split("\n"), 1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        term, equals, replacement = (" ".join(each.split()) for each in line.partition("="))
-        fault = _find_fault(term, replacement) if equals else "'=' is missing; write: WORD = how it is said"
-        if not fault and "[[" in replacement and not phonemes:
-            fault = "this driver can't speak phonemes"
-        if not fault and term in terms:
-            fault = f"'{term}' is already in line {lines[term]}"
-        if fault:
+        term, _, replacement = (" ".join(each.split()) for each in line.partition("="))
+        problems = {
+            "it has a control character, or is not valid UTF-8": _UNSPEAKABLE.search(line),
+            "write it like this: WORD = how it is said": not (term and is_visible(replacement)),
+            f"it has more than {_MAX_LINE_CHARS} characters": len(line) > _MAX_LINE_CHARS,
+            "phonemes are 1 to 60 ASCII characters between [[ and ]]": not _REPLACEMENT.fullmatch(replacement),
+            f"'{term}' is already in an earlier line": term in terms,
+        }
+        if fault := next((words for words, applies in problems.items() if applies), None):
             faults.append(f"line {number}: {fault}")
         else:
-            terms[term], lines[term] = " ".join(_PHONEMES.sub(r" \g<0> ", replacement).split()), number
+            terms[term] = " ".join(_PHONEMES.sub(r" \g<0> ", replacement).split())
     return terms, faults
-
-
-def _find_fault(term: str, replacement: str) -> str | None:
-    """Return an error message if a term or its replacement is not valid."""
-    if any(unicodedata.category(each) in ("Cc", "Cs") for each in term + replacement):
-        return "it has a control character, or is not valid UTF-8"
-    if not term:
-        return "the word before '=' is missing"
-    if not is_visible(replacement):
-        return "the text after '=' is missing"
-    if len(term) > _MAX_TERM_CHARS or len(replacement) > _MAX_REPLACEMENT_CHARS:
-        return f"a word has at most {_MAX_TERM_CHARS} characters, and its replacement {_MAX_REPLACEMENT_CHARS}"
-    if not _REPLACEMENT.fullmatch(replacement):
-        return "phonemes must be 1 to 60 ASCII characters between [[ and ]]"
-    return None
 
 
 class PronunciationFile:
@@ -235,43 +181,36 @@ class PronunciationFile:
     If the file can't be read later, the last table stays in use.
     """
 
-    def __init__(self, path: str, report: Callable[[str], None] = lambda _: None, *, phonemes: bool = True) -> None:
-        """Read the file.
-
-        Args:
-            path: the path of the file.
-            report: called with each message for the log.
-            phonemes: whether the driver supports phonemes.
+    def __init__(self, path: str, report: Callable[[str], None]) -> None:
+        """Read the file. Call `report` with each message for the log, now and later.
 
         Raises:
             UsageError: the file can't be read.
         """
-        self.path = os.path.abspath(path)
-        self._report, self._phonemes = report, phonemes
-        self.table = Pronunciations({})
-        #: messages about the faulty lines
-        self.faults: list[str] = []
-        #: why the file can't be read any more, or None
-        self.problem: str | None = None
+        self.path, self._report = os.path.abspath(path), report
+        #: values of which at least one changes when the file changes
         self._stamp: tuple[int, ...] = ()
-        try:
-            self._read()
-        except (OSError, ValueError) as error:
-            raise UsageError(f"--pronounce: {self.path} {_explain(error)}") from error
+        #: why the file can't be read any more, if it can't, and messages about faulty lines, up to a limit
+        self._problem, self._faults = "", list[str]()
+        self._table = Pronunciations({})
+        self.refresh()
 
     def refresh(self) -> Pronunciations:
         """Read the file again if it has changed. Return the table.
 
         If the file can't be read, report this once, and return the last table.
         """
-        before, self.problem = self.problem, None
+        problem = ""
         try:
             self._read()
         except (OSError, ValueError) as error:
-            self.problem = _explain(error)
-            if self.problem != before:
-                self._report(f"{self.path} {self.problem}; the terms that were read last stay in use")
-        return self.table
+            problem = f"can't be read: {error.strerror if isinstance(error, OSError) else error}"
+            if not self._stamp:
+                raise UsageError(f"--pronounce: {self.path} {problem}") from error
+            if problem != self._problem:
+                self._report(f"{self.path} {problem}; the terms that were read last stay in use")
+        self._problem = problem
+        return self._table
 
     def _read(self) -> None:
         """Read the file if it has changed. This never waits for a pipe or a device.
@@ -279,47 +218,22 @@ class PronunciationFile:
         Raises:
             OSError, ValueError: the file can't be read.
         """
-        if (stamp := _stamp(_require_file(os.stat(self.path)))) != self._stamp:
-            descriptor = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
-            with open(descriptor, "rb") as file:
-                stamp = _stamp(_require_file(os.fstat(descriptor)))
-                terms, self.faults = parse_pronunciations(file.read(MAX_FILE_BYTES), phonemes=self._phonemes)
-            self.table, self._stamp = Pronunciations(terms), stamp
-            self._report(f"read {len(terms)} pronunciation{'s' * (len(terms) != 1)} from {self.path}")
-            for each in self.describe_faults():
-                self._report(each)
-
-    def describe_faults(self) -> list[str]:
-        """Return a message about each faulty line, up to a limit."""
-        more = len(self.faults) - _MAX_SHOWN_FAULTS
-        shown = [f"{self.path}, {each} (the line is left out)" for each in self.faults[:_MAX_SHOWN_FAULTS]]
-        return [*shown, f"{self.path}: {more} more faulty lines"] if more > 0 else shown
+        if not stat.S_ISREG(os.stat(self.path).st_mode):
+            raise ValueError("it is not a regular file")
+        with open(os.open(self.path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+            found = os.fstat(file.fileno())
+            stamp = found.st_mtime_ns, found.st_ctime_ns, found.st_size, found.st_ino, found.st_dev
+            if stamp == self._stamp:
+                return
+            data = file.read(MAX_FILE_BYTES + 1)
+        if len(data) > MAX_FILE_BYTES:
+            raise ValueError(f"it is larger than {MAX_FILE_BYTES >> 10} KiB")
+        terms, faults = parse_pronunciations(data)
+        self._table, self._stamp, self._faults = Pronunciations(terms), stamp, faults[:_MAX_NAMED_FAULTS]
+        for each in self._faults:
+            self._report(f"{self.path}, {each}; the line is left out")
 
     def describe(self) -> JsonObject:
-        """Read the file again if it has changed. Return its path, number of terms and faults for `status`."""
-        self.refresh()
-        return {
-            "file": self.path,
-            "terms": len(self.table.terms),
-            "faults": self.faults[:_MAX_SHOWN_FAULTS],
-            "problem": self.problem,
-        }
-
-
-def _explain(error: OSError | ValueError) -> str:
-    """Return why a file can't be read."""
-    return f"can't be read: {error.strerror if isinstance(error, OSError) else error}"
-
-
-def _require_file(found: os.stat_result) -> os.stat_result:
-    """Return the argument if it describes a regular file of limited size. Otherwise, raise ValueError."""
-    if not stat.S_ISREG(found.st_mode):
-        raise ValueError("it is not a regular file")
-    if found.st_size > MAX_FILE_BYTES:
-        raise ValueError(f"it is larger than {MAX_FILE_BYTES >> 10} KiB")
-    return found
-
-
-def _stamp(found: os.stat_result) -> tuple[int, ...]:
-    """Return a file's times, size and identity, which show whether the file has changed."""
-    return found.st_mtime_ns, found.st_ctime_ns, found.st_size, found.st_ino, found.st_dev
+        """Read the file again if it has changed. Return its path, number of terms and problems for `status`."""
+        terms, problems = len(self.refresh().terms), [*filter(None, [self._problem]), *self._faults]
+        return {"file": self.path, "terms": terms, "problems": problems}

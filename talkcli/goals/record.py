@@ -15,8 +15,6 @@ from talkcli.goals.options import SHOWN_OPTIONS, Say, Set, require_fields
 from talkcli.goals.states import TRANSITIONS, IllegalTransition, State
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from talkcli.goals.reasons import Reason, Refusal
 
 #: Fields of a goal that are set after the goal was accepted.
@@ -52,7 +50,7 @@ class Record:
     by: By | None = None
     message: str | None = None
     #: terms of the text with their replacements, or None before the goal has started
-    pronunciations: Mapping[str, str] | None = None
+    pronunciations: dict[str, str] | None = None
     #: offset of the end of the last word that has started, or 0 if nothing was heard
     begun_end: int = 0
     #: offset of the end of the last word that was heard completely

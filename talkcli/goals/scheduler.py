@@ -29,7 +29,7 @@ from talkcli.goals.states import IllegalTransition, State
 from talkcli.goals.voices import VoiceDropOrder, VoiceLoadOrder, VoiceScheduler, VoiceWarning
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
+    from collections.abc import Collection
 
     from talkcli.goals.options import Append, Cancel, Say, Set
 
@@ -592,7 +592,7 @@ class Scheduler:
         self._require_active(goal_id).voice = voice
         return self._order_next_voice(now)
 
-    def pronunciations_chosen(self, goal_id: str, pronunciations: Mapping[str, str]) -> None:
+    def pronunciations_chosen(self, goal_id: str, pronunciations: dict[str, str]) -> None:
         """Record how terms in the active goal's text are replaced."""
         self._require_active(goal_id).pronunciations = pronunciations
 

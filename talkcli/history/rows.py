@@ -36,6 +36,8 @@ CREATE INDEX IF NOT EXISTS goals_by_end ON goals (ended_at);
 COLUMNS = ("id", "ended_at", "state", "name", "key", "text", "other")
 #: The fields of a goal that have columns of their own, and the goal's field `spoken`.
 _SEPARATE_FIELDS = {"id", "ended_at", "state", "key", "text", "spoken"}
+#: The fields of a goal that may quote its text, besides the sender.
+_TEXT_FIELDS = ("text", "said", "spoken", "message")
 _DEFAULTS = Goal("", State.PENDING).to_json()
 #: For the id and for each filter of a `log` request: its SQL condition, its column, and a function that compares the
 #: value in the column with the filter's value.
@@ -99,10 +101,8 @@ def row_to_json(row: Row) -> JsonObject:
 
 def without_text(goal: Goal) -> Goal:
     """Return a copy of a goal without its text, and without all fields that may quote the text."""
-    by = goal.by and By(goal.by.goal, _without_command_line(goal.by.client))
-    return replace(
-        goal, text=None, said=None, spoken=None, message=None, client=_without_command_line(goal.client), by=by
-    )
+    by, hidden = goal.by and By(goal.by.goal, _without_command_line(goal.by.client)), dict.fromkeys(_TEXT_FIELDS)
+    return replace(goal, client=_without_command_line(goal.client), by=by, **hidden)
 
 
 def _without_command_line(sender: Sender | None) -> Sender | None:

@@ -400,12 +400,10 @@ class Requests:
         if request.id is None:
             self._answer_overview(pending)
         else:
-            speech = self._speech
-            history, known = speech.history, self._scheduler.find(request.id)
+            history, known = self._speech.history, self._scheduler.find(request.id)
             rows = await history.search(pending, {"id": request.id}, 1) if history and not known else []
-            pending.answer(
-                goal=row_to_json(rows[0]) if rows else speech.describe_goal(self._require_goal(request.id)).to_json()
-            )
+            record = None if rows else self._require_goal(request.id)
+            pending.answer(goal=self._speech.describe_goal(record).to_json() if record else row_to_json(rows[0]))
 
     async def _watch(self, pending: PendingRequest, _: Watch) -> None:
         """Reply with the state of the server, and subscribe the client to all events."""

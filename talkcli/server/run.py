@@ -126,8 +126,10 @@ class Server:
         self.speech.on_status_change = self._systemd.schedule_status
         self._open_history()
         if settings.pronounce:
-            phonemes = is_own_driver(settings.driver)
-            self.speech.pronunciation_file = PronunciationFile(settings.pronounce, _log_line, phonemes=phonemes)
+            if not is_own_driver(settings.driver):
+                raise UsageError("--pronounce only works with talk's own driver; leave out --driver (on Linux)")
+            path = settings.pronounce
+            self.speech.pronunciation_file = PronunciationFile(path, lambda words: log.write(log.sanitize(words)))
         self._requests = Requests(self.speech, self._describe)
         self.handle, self.is_waiting = self._requests.handle, self._requests.is_waiting
         self.input_ended = self._requests.input_ended
@@ -362,11 +364,6 @@ class Server:
         with contextlib.suppress(OSError):
             self._listener.close()
         os._exit(EXIT_SIGNAL + number)
-
-
-def _log_line(line: str) -> None:
-    """Write a line with text from a file to the log."""
-    log.write(log.sanitize(line))
 
 
 def _random_boot_id() -> str:

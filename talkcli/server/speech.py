@@ -26,15 +26,7 @@ from talkcli.errors import TalkError, UsageError
 from talkcli.frozen import replace
 from talkcli.goals import options as goal_options
 from talkcli.goals.goal import By, Goal, Output, Sender
-from talkcli.goals.options import (
-    DEFAULTS,
-    ENGINE_OPTIONS,
-    SOUND,
-    engine_options,
-    is_neural,
-    require_fields,
-    without_speaker,
-)
+from talkcli.goals.options import DEFAULTS, ENGINE_OPTIONS, engine_options, is_neural, require_fields, without_speaker
 from talkcli.goals.reasons import Reason
 from talkcli.goals.scheduler import Effect, EngineOrder, Interruption, Now, Order, PauseChange, StateChange
 from talkcli.goals.states import State
@@ -46,7 +38,7 @@ from talkcli.server.voices import VoiceCatalog
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from talkcli.engine.parent.supervisor import Supervisor
     from talkcli.engine.pronunciation import PronunciationFile
@@ -267,14 +259,14 @@ class Speech:
                 return
             options["pitch"] = DEFAULTS.pitch  # neural voices don't support other pitches
         if record.pronunciations is None:
-            self.scheduler.pronunciations_chosen(record.id, self._choose_pronunciations(record))
+            self.scheduler.pronunciations_chosen(record.id, self._current_pronunciations())
         command = protocol.Speak(
             record.id,
             record.say.text,
             next_waits=next_waits,
             next_is_neural=next_is_neural,
             more=record.more,
-            pronunciations=dict(record.pronunciations or {}) or None,
+            pronunciations=record.pronunciations or None,
             broken=record.broken,
             start=record.rest,
             heard_end=record.begun_end,
@@ -284,22 +276,18 @@ class Speech:
         )
         self.engine.speak(command)
 
-    def _choose_pronunciations(self, record: Record) -> Mapping[str, str]:
-        """Return the terms to replace in a goal's text. For a text that may grow, these are all terms."""
-        if self.pronunciation_file is None or record.say.format == SOUND:
-            return {}
-        table = self.pronunciation_file.refresh()
-        return table.terms if record.more else table.apply_to_goal(record.say.text, record.say.format).replaced
+    def _current_pronunciations(self) -> dict[str, str]:
+        """Return the terms to replace in goals that start now."""
+        return self.pronunciation_file.refresh().terms if self.pronunciation_file else {}
 
     def describe_goal(self, record: Record) -> Goal:
         """Return a copy of a goal that also has the text as it is said, or would be said if it started now."""
         goal, terms = record.snapshot(), record.pronunciations
         if terms is None and goal.state is State.PENDING:
-            terms = self._choose_pronunciations(record)
-        if terms is None or goal.text is None:
+            terms = self._current_pronunciations()
+        if terms is None or goal.text is None or record.say.is_sound:
             return goal
-        said = Pronunciations(terms).apply_to_goal(goal.text, goal.format).for_people(goal.format)
-        return goal if said == goal.text else replace(goal, said=said)
+        return replace(goal, said=Pronunciations(terms).say(goal.text, goal.format))
 
     def _announce_next(self) -> None:
         """Tell the engine whether another goal follows the active one."""

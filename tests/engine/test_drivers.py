@@ -141,18 +141,6 @@ def test_a_driver_gets_a_text_in_markdown_without_its_marks() -> None:
         assert [(word.start, word.end) for word in engine.words()] == [(2, 9), (13, 16)]
 
 
-def test_a_driver_speaks_terms_as_replaced_and_resumes_within_the_sent_text() -> None:
-    with Engine(driver="timed", before=TIMED_DRIVER, alive_every=0.3) as engine:
-        terms = {"kW": "kilo watt", "ROS 2": "ross two"}
-        engine.send(protocol.Speak("g1", "5 kW for ROS 2 now", 200, 1.0, None, 50, pronunciations=terms))
-        engine.until_word(4)
-        engine.pause()
-        engine.resume()
-        assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
-        assert [(word.start, word.end) for word in engine.words()] == [(0, 1), (2, 4), (5, 8), (9, 12), (15, 18)]
-        assert _driver_texts(engine) == ["5 kilo watt for ross two now", "ross two now"]
-
-
 @pytest.mark.parametrize(
     ("more", "reason", "message"),
     [

@@ -302,7 +302,7 @@ def test_another_users_socket_before_the_servers_one_is_a_warning() -> None:
     assert "/a: another user's server (uid 7)" in finding.message
 
 
-PRONUNCIATIONS = {"file": "/n.txt", "terms": 3, "faults": ["line 4: '=' is missing"], "problem": None}
+PRONUNCIATIONS = {"file": "/n.txt", "terms": 3, "problems": ["line 4: write it like this"]}
 
 
 @pytest.mark.parametrize(
@@ -321,9 +321,8 @@ PRONUNCIATIONS = {"file": "/n.txt", "terms": 3, "faults": ["line 4: '=' is missi
         ({"ttl": 5.0, "lead_in": 300, "preempt": True}, "settings", OK, "None"),
         ({"history": {"path": "/h.db", "with_text": True, "error": None}}, "history", OK, "None"),
         ({"history": {"path": "/h.db", "error": "disk full", "dropped": 3}}, "history", WARNING, "free some space"),
-        ({"pronunciations": {**PRONUNCIATIONS, "faults": []}}, "pronunciation", OK, "None"),
-        ({"pronunciations": PRONUNCIATIONS}, "pronunciation", WARNING, "correct /n.txt"),
-        ({"pronunciations": {**PRONUNCIATIONS, "problem": "is gone"}}, "pronunciation", WARNING, "put the file back"),
+        ({"pronunciations": {**PRONUNCIATIONS, "problems": []}}, "pronunciation", OK, "None"),
+        ({"pronunciations": PRONUNCIATIONS}, "pronunciation", WARNING, "correct the file"),
         ({"volume": 0.1 + 0.2, "ttl": 1.23456789012}, "settings", OK, "None"),
     ],
 )

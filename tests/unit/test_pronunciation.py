@@ -27,6 +27,7 @@ TERMS = {
     "US": "you ess",
     "us": "uss",
     "café": "ka fay",
+    "cafe": "coffee",
     "充电桩": "桩",
     "24/7": "all day",
 }
@@ -40,7 +41,7 @@ SAID = {
     "GmbH's (GmbH) «GmbH»": "gay em bay ha's (gay em bay ha) «gay em bay ha»",
     "C++, .NET 24/7 124/7": "see plus plus, dot net all day 124/7",
     # accents, and scripts without blanks
-    "café cafe\u0301 cafe\u0301s cafe": "ka fay ka fay cafe\u0301s cafe",
+    "café cafe\u0301 cafe\u0301s cafe": "ka fay cafe\u0301 cafe\u0301s coffee",
     "我去充电桩了": "我去桩了",
     # a term without capital letters matches any case, and an exact match comes first
     "gmbh GMBH US us Us CAFÉ": "gmbh GMBH you ess uss uss ka fay",
@@ -71,7 +72,7 @@ def test_each_word_of_the_spoken_text_is_located_in_the_sent_text(text: str, sta
     kept = [(said, text[place]) for said, (place, chars) in places if chars == 1 and not said.isspace()]
     assert [said.translate(BRACKETS) for said, _ in kept] == [sent.translate(BRACKETS) for _, sent in kept]
     terms = {" ".join(text[place:][:chars].split()) for _, (place, chars) in places if chars > 1}
-    assert terms == spoken.replaced.keys()
+    assert terms <= TERMS.keys()
 
 
 def test_a_part_ends_after_a_term_that_it_would_cut() -> None:
@@ -103,13 +104,11 @@ control = \x07
 long = {}
 """.format("x" * 201)
 FAULTS = {
-    5: "'=' is missing; write: WORD = how it is said",
-    6: "the text after '=' is missing",
-    7: "the word before '=' is missing",
-    **dict.fromkeys((8, 9, 10), "phonemes must be 1 to 60 ASCII characters between [[ and ]]"),
-    11: "'charger' is already in line 3",
+    **dict.fromkeys((5, 6, 7), "write it like this: WORD = how it is said"),
+    **dict.fromkeys((8, 9, 10), "phonemes are 1 to 60 ASCII characters between [[ and ]]"),
+    11: "'charger' is already in an earlier line",
     12: "it has a control character, or is not valid UTF-8",
-    13: "a word has at most 100 characters, and its replacement 200",
+    13: "it has more than 200 characters",
     14: "it has a control character, or is not valid UTF-8",
 }
 
@@ -129,26 +128,23 @@ def test_a_changed_file_is_read_again_and_a_lost_one_is_reported_once(tmp_path: 
 
     path.write_text("a = b\nfaulty\n" * 12)
     file = PronunciationFile(str(path), log.append)
-    assert len(log) == 12
-    assert log[::11] == [f"read 1 pronunciation from {path}", f"{path}: 13 more faulty lines"]
+    fault = "line 2: write it like this: WORD = how it is said"
+    assert (len(log), log[0]) == (10, f"{path}, {fault}; the line is left out")
     assert refresh() == ({"a": "b"}, [])
     path.write_text("a = c\n")
-    assert refresh() == ({"a": "c"}, [f"read 1 pronunciation from {path}"])
+    assert refresh() == ({"a": "c"}, [])
     path.unlink()
     problem = "can't be read: No such file or directory"
     assert refresh() == ({"a": "c"}, [f"{path} {problem}; the terms that were read last stay in use"])
     assert refresh() == ({"a": "c"}, [])
-    assert file.describe()["problem"] == problem
+    assert file.describe() == {"file": str(path), "terms": 1, "problems": [problem]}
     os.mkfifo(path)
     assert "it is not a regular file" in refresh()[1][0]
     assert refresh() == ({"a": "c"}, [])
     path.unlink()
-    path.write_text("a = d\nfaulty\nb = [[b]]\n")
-    file._phonemes = False
-    faults = ["line 2: '=' is missing; write: WORD = how it is said", "line 3: this driver can't speak phonemes"]
-    shown = [f"{path}, {each} (the line is left out)" for each in faults]
-    assert refresh() == ({"a": "d"}, [f"read 1 pronunciation from {path}", *shown])
-    assert file.describe() == {"file": str(path), "terms": 1, "faults": faults, "problem": None}
+    path.write_text("a = d\nfaulty\n")
+    assert file.describe() == {"file": str(path), "terms": 1, "problems": [fault]}
+    assert refresh() == ({"a": "d"}, [])
 
 
 @pytest.mark.parametrize("kind", ["missing", "directory", "pipe", "device", "large"])
@@ -163,5 +159,5 @@ def test_a_file_that_cannot_be_read_is_refused_at_once(kind: str, tmp_path: Path
             file.truncate(MAX_FILE_BYTES + 1)
     began = time.monotonic()
     with pytest.raises(UsageError, match=r"^--pronounce: .* can't be read: "):
-        PronunciationFile("/dev/zero" if kind == "device" else str(path))
+        PronunciationFile("/dev/zero" if kind == "device" else str(path), print)
     assert time.monotonic() - began < 1

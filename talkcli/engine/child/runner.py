@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from talkcli.engine.child.players.chooser import PlayerChooser
     from talkcli.engine.child.synthesizers.combined import CombinedSynthesizer
     from talkcli.engine.markdown import MarkdownReader
-    from talkcli.engine.pronunciation import SpokenText
     from talkcli.engine.sounds import SoundLibrary
     from talkcli.goals.goal import Output
 
@@ -109,8 +108,6 @@ class ActiveGoal:
         self.text_missing = False
         #: how to say terms in the text
         self.pronunciations = Pronunciations(command.pronunciations or {})
-        #: the text that a third-party driver is speaking
-        self.spoken_text: SpokenText | None = None
         #: number of characters received, and how many of them the server knows to be received
         self.length, self.reported_length = len(command.text), 0
         self.words = WordFinder(self.text, max(command.start, command.heard_end), command.heard_words)
@@ -124,6 +121,8 @@ class ActiveGoal:
         self.with_driver = False
         #: whether a third-party driver was stopped in order to pause or interrupt the goal
         self.interrupted = False
+        #: offset in the text at which the driver started speaking
+        self.offset = 0
         #: offset in the text of the last word heard
         self.last_word = command.start
         self.stop_requested = False
@@ -428,12 +427,12 @@ class GoalRunner:
     def _send_to_driver(self, goal: ActiveGoal) -> None:
         """Send the text to the driver, beginning at the last word heard."""
         goal.progress_at = goal.resumed_at = time.monotonic()
+        goal.offset = goal.last_word
         goal.with_driver, goal.interrupted = True, False
         # pyttsx3 refuses blanks, so a growing text is sent with its marks. The driver ignores this text anyway.
         text = goal.command.text if goal.growing_text else goal.text
         if self._step_run_loop is not None:
-            goal.spoken_text = goal.pronunciations.apply(goal.text, goal.last_word)
-            text = goal.spoken_text.text
+            text = goal.text[goal.offset :]
         if self._engine.say(text, goal.id) is not None:
             self._fail_goal(Reason.NOTHING_TO_SAY, "nothing in the text can be spoken")
 
@@ -467,8 +466,7 @@ class GoalRunner:
         if word is not None:
             word = replace(word, position=word.position + goal.command.heard)
         else:
-            located = goal.spoken_text.locate(location, length) if goal.spoken_text else (location, length)
-            if located and location >= 0 and (found := self.find_word(*located)):
+            if found := self.find_word(goal.offset + location if location >= 0 else location, length):
                 word = TimedWord(*found, goal.speech_seconds(goal.progress_at))
         if word is not None:
             goal.last_word = word.start

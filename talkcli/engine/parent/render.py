@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING
 
 from talkcli.engine import protocol
 from talkcli.engine.parent.process import EngineFailed, PrivateEngine
-from talkcli.engine.pronunciation import Pronunciations
 from talkcli.errors import EXIT_ERROR, TalkError, UsageError
 from talkcli.goals.options import DEFAULTS, MAX_TEXT_CHARS, SOUND_OPTIONS, bad_text
 from talkcli.goals.reasons import Reason
@@ -75,7 +74,7 @@ def render(
     *,
     driver: str | None = None,
     markdown: bool = False,
-    pronunciations: Pronunciations | None = None,
+    pronunciations: dict[str, str] | None = None,
     timeout: float | None = None,
     interrupt: Mapping[int, int] | None = None,
     **sound: Any,
@@ -87,7 +86,7 @@ def render(
         path: the file to write, or "-" for standard output.
         driver: name of a pyttsx3 driver, or None for the default.
         markdown: whether the text is written in Markdown, whose marks are not spoken.
-        pronunciations: how to say terms in the text.
+        pronunciations: terms of the text with their replacements.
         timeout: time limit in seconds, or None for no limit.
         interrupt: descriptors that interrupt the rendering, as in `polling.wait_ready`.
         sound: rate, volume, voice and pitch, if they differ from the defaults.
@@ -100,7 +99,9 @@ def render(
         BrokenPipeError: the reader of standard output has closed it.
     """
     deadline = time.monotonic() + (float("inf") if timeout is None else timeout)
-    _require_speakable(text)
+    fault = bad_text(text, None)
+    if fault is not None:
+        raise RenderFailed(*fault)
     sound = {each.name: getattr(DEFAULTS, each.name) for each in SOUND_OPTIONS} | sound
     if markdown:
         from talkcli.engine.markdown import blank_markdown  # rarely needed, and slow to import
@@ -108,11 +109,8 @@ def render(
         text = blank_markdown(text)  # before the text is cut into pieces
     # A rendering can wait for its voice to load. A file with a different voice would be useless.
     numbered = enumerate(split_into_pieces(text), 1)
-    table = pronunciations or Pronunciations({})
-    commands = (
-        protocol.Speak(f"{number}", piece, **sound, voice_only=True, pronunciations=table.apply(piece).replaced or None)
-        for number, piece in numbered
-    )
+    more = {**sound, "voice_only": True, "pronunciations": pronunciations}
+    commands = (protocol.Speak(f"{number}", piece, **more) for number, piece in numbered)
     with contextlib.ExitStack() as stack:
         player: str | None = None
         output_fd: int | None = None
@@ -134,30 +132,6 @@ def render(
             if output_fd is not None and path in STANDARD_OUTPUT and wait_ready({output_fd: 0}, 0.0):
                 raise BrokenPipeError(errno.EPIPE, "the program that reads standard output has closed it") from error
             raise
-
-
-def check_text(text: str, *, timeout: float | None = None, voice: str | None = None, **_: Any) -> None:
-    """Check a text and its voice without rendering them.
-
-    Raises:
-        RenderFailed: the text can't be spoken, or the voice is unknown.
-        TimeoutError: the time limit was exceeded.
-    """
-    _require_speakable(text)
-    configure = protocol.Configure(os.getpid(), None, "null", None, voice, list_voices=False)
-    deadline = time.monotonic() + (float("inf") if timeout is None else timeout)
-    try:
-        with PrivateEngine(configure, deadline=deadline) as engine:
-            engine.wait_for(protocol.Ready)
-    except EngineFailed as error:
-        raise _convert_engine_error(error, None) from error
-
-
-def _require_speakable(text: str) -> None:
-    """Raise RenderFailed if a text obviously can't be spoken."""
-    fault = bad_text(text, None)
-    if fault is not None:
-        raise RenderFailed(*fault)
 
 
 def split_into_pieces(text: str) -> Iterator[str]:
