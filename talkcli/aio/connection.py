@@ -116,10 +116,8 @@ class LoopConnection(Connection):
 
         The arguments are those of `wait_until`.
         """
-        if done():
-            return True
-        if self.ended is not None:
-            return False
+        if (is_done := done()) or self.ended is not None:
+            return is_done
         future: asyncio.Future[bool] = asyncio.get_running_loop().create_future()
         self._waits[future] = done, NEVER if deadline is None else deadline, time.monotonic()
         self._run_soon()

@@ -48,14 +48,10 @@ def with_parameters_of(
     return lambda method: method
 
 
-class ClientCalls:
-    """The calls of a client. Those that wait are coroutines."""
+class ConnectedClient:
+    """The base class of all clients, which describes the server of a client's connection."""
 
-    def __init__(self, connection: Connection) -> None:
-        """Use a connection that has received the server's greeting."""
-        self._connection = connection
-        #: the first server's boot id, which is prepended to ids that are only numbers
-        self._first_boot = connection.boot
+    _connection: Connection
 
     @property
     def path(self) -> str:
@@ -66,6 +62,16 @@ class ClientCalls:
     def server_pid(self) -> int | None:
         """The server's process id."""
         return self._connection.server.pid
+
+
+class ClientCalls(ConnectedClient):
+    """The calls of a client. Those that wait are coroutines."""
+
+    def __init__(self, connection: Connection) -> None:
+        """Use a connection that has received the server's greeting."""
+        self._connection = connection
+        #: the first server's boot id, which is prepended to ids that are only numbers
+        self._first_boot = connection.boot
 
     async def cancel(
         self,
@@ -295,10 +301,9 @@ class SayingCalls:
         """Send the goal. Return its handle."""
         try:
             handle = await self._client._say(handle_type, *self._text, **self._options)
-        except TalkError:
-            raise
-        except BaseException:
-            self._client._connection.begin(Cancel((self._options["id"],)), on_failure=lambda _: None)
+        except BaseException as error:
+            if not isinstance(error, TalkError):
+                self._client._connection.begin(Cancel((self._options["id"],)), on_failure=lambda _: None)
             raise
         self._cancel = handle._cancel
         return handle

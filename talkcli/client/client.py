@@ -12,7 +12,7 @@ All errors except TimeoutError are subclasses of `talkcli.errors.TalkError`.
 
 from __future__ import annotations
 
-from talkcli.client.calls import ClientCalls, SayingCalls, with_parameters_of
+from talkcli.client.calls import ClientCalls, ConnectedClient, SayingCalls, with_parameters_of
 from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.client.connection import ReconnectingConnection
 from talkcli.client.goal import GoalHandle
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 __all__ = ["Client", "GoalHandle"]
 
 
-class Client:
+class Client(ConnectedClient):
     """A connection to a talk server.
 
     The client looks for the server in the same places as the command `talk`. If the connection breaks, for example
@@ -60,7 +60,7 @@ class Client:
             UsageError: the name is too long, or the timeout is not positive.
             ServerUnavailable, AccessDenied, Busy, ProtocolMismatch: there is no server that can be used.
         """
-        self._connection: Connection = run_blocking(ReconnectingConnection.open(socket, name=name, patience_s=timeout))
+        self._connection = run_blocking(ReconnectingConnection.open(socket, name=name, patience_s=timeout))
         self._calls = ClientCalls(self._connection)
 
     @classmethod
@@ -69,16 +69,6 @@ class Client:
         client = cls.__new__(cls)
         client._connection, client._calls = connection, ClientCalls(connection)
         return client
-
-    @property
-    def path(self) -> str:
-        """The path of the server's socket."""
-        return self._calls.path
-
-    @property
-    def server_pid(self) -> int | None:
-        """The server's process id."""
-        return self._calls.server_pid
 
     def close(self) -> None:
         """Close the connection. Goals that were sent are still spoken."""

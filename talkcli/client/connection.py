@@ -362,11 +362,7 @@ class SocketConnection(Connection):
     """A connection over a Unix socket."""
 
     def __init__(
-        self,
-        attempt: ConnectionAttempt,
-        patience_s: float,
-        reopen: tuple[str | None, str | None, JsonObject],
-        interrupt: Mapping[int, int] | None,
+        self, attempt: ConnectionAttempt, patience_s: float, reopen: tuple[str | None, str | None, JsonObject]
     ) -> None:
         """Use the connection of an attempt that has read the server's greeting.
 
@@ -374,10 +370,8 @@ class SocketConnection(Connection):
             attempt: the attempt.
             patience_s: seconds in which the server must answer.
             reopen: the named socket, the sender's name and the hello message, which are needed to connect again.
-            interrupt: descriptors that interrupt any wait.
         """
         super().__init__(patience_s)
-        self._interrupt = interrupt
         self._named, self._name, self._hello_message = reopen
         #: the socket, or None while disconnected
         self._socket: _socket.socket | None = attempt.socket
@@ -424,7 +418,9 @@ class SocketConnection(Connection):
         give_up = time.monotonic() + keep_trying_s
         found = await connect(named, message, patience_s, interrupt, attempt, keep_trying_s, end, cls.wait)
         patience_s = max(patience_s, round(give_up - time.monotonic(), 1))
-        return cls(found, patience_s, (named, name, message), interrupt)
+        connection = cls(found, patience_s, (named, name, message))
+        connection._interrupt = interrupt
+        return connection
 
     async def open_another(self) -> Connection:
         """Open another connection to the same server, with the same name, and return it.

@@ -147,8 +147,8 @@ class Fleet(FleetCalls["FleetRequest"]):
         """
         from talkcli.fleet.desk.watch import read_robots
 
-        found = run_blocking(read_robots(self._broker, ANSWER_LIMIT_S, with_status=False))
-        return [each.presence for each in found]
+        robots = run_blocking(read_robots(self._broker, ANSWER_LIMIT_S, with_status=False))
+        return [each.presence for each in robots]
 
     def robot(self, name: str) -> Client:
         """Connect to one robot. The returned client works like the client of a local server.

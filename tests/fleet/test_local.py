@@ -14,7 +14,7 @@ import pytest
 from talkcli import __version__
 from talkcli.client.core import Exchange
 from talkcli.errors import Busy, ServerUnavailable
-from talkcli.fleet.bridge.local import dial
+from talkcli.fleet.bridge.local import LocalConnection
 from talkcli.goals.options import Say
 from talkcli.protocol.events import busy_greeting, greeting
 from talkcli.protocol.lines import decode, encode
@@ -25,7 +25,6 @@ from tests.support.surroundings import needs_packages, short_directory
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
 
-    from talkcli.fleet.bridge.local import LocalConnection
     from talkcli.fleet.link import Link
 
 GREETING = encode(greeting(__version__, 7, "a1b2"))
@@ -52,7 +51,7 @@ async def accepted(listening: socket.socket) -> socket.socket:
 @contextlib.asynccontextmanager
 async def greeted(listening: socket.socket) -> AsyncIterator[tuple[LocalConnection, socket.socket]]:
     """Connect to the socket, and yield both ends of the connection."""
-    dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
+    dialing = asyncio.create_task(LocalConnection.open(listening.getsockname(), name="bob"))
     with await accepted(listening) as server:
         server.sendall(GREETING)
         yield await dialing, server
@@ -69,7 +68,7 @@ def lines(connected: socket.socket, count: int) -> list[bytes]:
 async def test_a_greeting_may_arrive_late_or_in_pieces(
     listening: socket.socket, parts: tuple[bytes, ...], wait: float
 ) -> None:
-    dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
+    dialing = asyncio.create_task(LocalConnection.open(listening.getsockname(), name="bob"))
     with await accepted(listening) as server:
         for part in parts:
             await asyncio.sleep(wait)
@@ -158,13 +157,10 @@ async def test_a_connection_ends_if_a_line_cannot_be_sent(listening: socket.sock
 
 @pytest.mark.parametrize("answer", [encode(busy_greeting()), b"220 mail\n", b""])
 @in_loop
-async def test_a_refused_connection_raises_busy_or_unavailable(
-    listening: socket.socket, answer: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("talkcli.client.connect.ANSWER_LIMIT_S", 0.3)
-    dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
+async def test_a_refused_connection_raises_busy_or_unavailable(listening: socket.socket, answer: bytes) -> None:
+    dialing = asyncio.create_task(LocalConnection.open(listening.getsockname(), name="bob", patience_s=0.3))
     with contextlib.suppress(TimeoutError):
-        while not dialing.done():  # `dial` retries while the server is busy
+        while not dialing.done():  # `open` retries while the server is busy
             listening.settimeout(0.5)
             with await accepted(listening) as server:
                 server.sendall(answer)
@@ -183,7 +179,7 @@ async def test_the_next_socket_is_tried_if_a_server_refuses_this_user(
         first.settimeout(PATIENCE)
         sockets = [first.getsockname(), listening.getsockname()]
         monkeypatch.setattr("talkcli.paths.client_sockets", lambda _: sockets)
-        dialing = asyncio.create_task(dial(None, "bob"))
+        dialing = asyncio.create_task(LocalConnection.open(name="bob"))
         with await accepted(first) as refusing:
             refusing.sendall(encode({"talk": 1, "error": "forbidden", "message": "not you"}))
             with await accepted(listening) as server:
@@ -194,11 +190,8 @@ async def test_the_next_socket_is_tried_if_a_server_refuses_this_user(
 
 
 @in_loop
-async def test_a_server_that_does_not_greet_in_time_is_unavailable(
-    listening: socket.socket, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("talkcli.client.connect.ANSWER_LIMIT_S", 0.2)
-    dialing = asyncio.create_task(dial(listening.getsockname(), "bob"))
+async def test_a_server_that_does_not_greet_in_time_is_unavailable(listening: socket.socket) -> None:
+    dialing = asyncio.create_task(LocalConnection.open(listening.getsockname(), name="bob", patience_s=0.2))
     with await accepted(listening) as server:
         server.sendall(GREETING[:9])
         with pytest.raises(ServerUnavailable, match=f"doesn't respond; check process {os.getpid()}"):

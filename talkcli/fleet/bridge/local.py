@@ -1,43 +1,41 @@
 """The bridge's connections to the robot's server.
 
-They wrap the client core, run in the event loop, and return lines without decoding them.
+They are read by the event loop, and return lines without decoding them.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import socket
 from typing import TYPE_CHECKING
 
-from talkcli import paths
 from talkcli.aio.connection import wait_ready
-from talkcli.client import connect
-from talkcli.client.core import ClientCore
+from talkcli.client.connection import SocketConnection
 from talkcli.errors import ServerUnavailable
 from talkcli.protocol.lines import MAX_LINE_BYTES
 
 if TYPE_CHECKING:
+    from typing import Any
+
     from talkcli.client.connect import ConnectionAttempt
     from talkcli.client.core import Exchange
 
 _CHUNK_BYTES = 64 * 1024
 
 
-class LocalConnection(ClientCore):
+class LocalConnection(SocketConnection):
     """A connection to the robot's server. Only one task at a time may read from it.
 
     It doesn't use an asyncio transport, because connecting would then take about one and a half times as long. This
     matters when an operator cancels everything on a thousand robots.
     """
 
-    def __init__(self, attempt: ConnectionAttempt) -> None:
-        """Wrap the socket of an attempt that has read the server's greeting."""
-        assert attempt.socket
-        assert attempt.server
+    wait = staticmethod(wait_ready)
+
+    def __init__(self, attempt: ConnectionAttempt, *options: Any) -> None:
+        """Use the connection of an attempt that has read the server's greeting."""
+        super().__init__(attempt, *options)
         self._loop = asyncio.get_running_loop()
-        super().__init__(connect.ANSWER_LIMIT_S, self._loop.time())
-        self.path, self.server, self._socket = attempt.path, attempt.server, attempt.socket
         #: received lines that `read` has not returned yet
         self._lines = self.split(attempt.received, self._loop.time())
 
@@ -76,7 +74,7 @@ class LocalConnection(ClientCore):
         A waiting `read` must first be cancelled, or ended with `abort`. The server cancels the requests that it has not
         answered, if possible.
         """
-        if self._socket.fileno() >= 0:
+        if self._socket is not None and self._socket.fileno() >= 0:
             self._loop.remove_reader(self._socket)
             self._loop.remove_writer(self._socket)
             self._socket.close()
@@ -86,44 +84,19 @@ class LocalConnection(ClientCore):
 
         The reader must then call `close`.
         """
-        with contextlib.suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RDWR)
+        self._hang_up()
 
     def _flush(self) -> None:
         """Send as much queued data as possible without blocking.
 
         Send the rest when the socket becomes writable.
         """
-        if self._socket.fileno() < 0:
+        if self._socket is None or self._socket.fileno() < 0:
             return
-        try:
-            self.mark_sent(self._socket.send(self.outgoing()))
-        except BlockingIOError:
-            pass
-        except OSError as error:
-            # Send nothing more, because the server may have received half a line. `read` will report the error.
-            self.stop_sending(str(error))
-            self.abort()
+        super()._flush()
+        if self._sending_ended:
+            self.abort()  # the server may have received half a line; `read` will report the end
         if self.outgoing():
             self._loop.add_writer(self._socket, self._flush)
         else:
             self._loop.remove_writer(self._socket)
-
-
-async def dial(path: str | None, name: str, *, urgent: bool = False) -> LocalConnection:
-    """Connect to the server, and wait for its greeting. Return the connection.
-
-    Keep trying while the server is busy.
-
-    Args:
-        path: path of the server's socket, or None for the default locations.
-        name: the client's name.
-        urgent: whether the client sends only `status` and `cancel`. The server reserves connections for such clients.
-
-    Raises:
-        ServerUnavailable, AccessDenied, ProtocolMismatch, Busy: no usable server was found.
-    """
-    message = connect.hello(name, urgent=urgent)
-    return LocalConnection(
-        await connect.connect(paths.named_socket(path), message, connect.ANSWER_LIMIT_S, wait=wait_ready)
-    )

@@ -15,7 +15,7 @@ from talkcli.client.core import Exchange
 from talkcli.daemon import log
 from talkcli.errors import BadRequest, ServerUnavailable, TalkError
 from talkcli.fleet import topics
-from talkcli.fleet.bridge.local import dial
+from talkcli.fleet.bridge.local import LocalConnection
 from talkcli.fleet.bridge.policy import PRIVATE_FIELDS
 from talkcli.fleet.payloads import LastGoal, Message, RobotStatus
 from talkcli.frozen import fields, replace
@@ -38,7 +38,6 @@ from talkcli.protocol.requests import Watch
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from talkcli.fleet.bridge.local import LocalConnection
     from talkcli.fleet.bridge.session import RemoteSessions
     from talkcli.goals.goal import Goal, JsonObject
 
@@ -94,7 +93,7 @@ class Publisher:
         self._retry_s = _FIRST_SERVER_RETRY_S
         while True:
             try:
-                server = self._connection = await dial(self._sessions.socket, "talk bridge")
+                server = self._connection = await LocalConnection.open(self._sessions.socket, name="talk bridge")
                 try:
                     await self._watch_server(server)
                 finally:

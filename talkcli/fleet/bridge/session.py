@@ -19,7 +19,7 @@ from talkcli.client.core import Exchange
 from talkcli.daemon import log
 from talkcli.errors import BadRequest, Busy, TalkError
 from talkcli.fleet.bridge import policy
-from talkcli.fleet.bridge.local import dial
+from talkcli.fleet.bridge.local import LocalConnection
 from talkcli.fleet.link import boottime
 from talkcli.fleet.payloads import Message
 from talkcli.frozen import replace
@@ -33,7 +33,6 @@ from talkcli.protocol.requests import Hello, Resume, Status, Wait, Watch
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from talkcli.fleet.bridge.local import LocalConnection
     from talkcli.fleet.bridge.policy import RemoteRequest
     from talkcli.goals.goal import JsonObject
     from talkcli.protocol.requests import Request
@@ -435,7 +434,7 @@ class RemoteSession:
             async with shared.dialing:
                 if self._has_ended:
                     return
-                self._server = server = await dial(shared.socket, self._name, urgent=urgent)
+                self._server = server = await LocalConnection.open(shared.socket, name=self._name, urgent=urgent)
             while self._queue:
                 self._send_request(self._queue.popleft())
             self._end_if_done()

@@ -100,8 +100,6 @@ class DeskLink:
         #: functions that process messages and rejected requests. `process` calls them when the link isn't locked.
         self._calls: deque[Callable[[], object]] = deque()
         self._opening: LinkOpener | None = None
-        #: the MQTT connection at the last call of `prepare`
-        self._polled_link: Link | None = None
         self._failed_attempts = 0
         self._next_attempt_at = self._polled_at = time.monotonic()
         # If nobody calls `close`, the garbage collector closes sockets, but not pipes.
@@ -151,7 +149,6 @@ class DeskLink:
         watched = {self._wake_reader.fileno(): select.POLLIN}
         if link is not None and link.fileno() >= 0:  # The descriptor is -1 if another thread closed the link.
             watched[link.fileno()] = select.POLLIN | (select.POLLOUT if link.wants_write else 0)
-        self._polled_link = link
         return watched, due
 
     def process(self, ready: Collection[int]) -> bool:
@@ -159,16 +156,15 @@ class DeskLink:
 
         `ready` are those of the descriptors from the last call of `prepare` that are ready.
         """
-        wake = self._wake_reader.fileno()
-        if wake in ready:
+        if self._wake_reader.fileno() in ready:
             self._wake_reader.recv(4096)
         self._polled_at = time.monotonic()
-        has_data = self._polled_link is not None and bool({*ready} - {wake})
-        if self._polled_link is not None and has_data:
-            self._polled_link.read()
+        link = self.link if self.link and self.link.fileno() in ready else None
+        if link:
+            link.read()
         while self._calls:
             self._calls.popleft()()
-        return has_data
+        return link is not None
 
     def _receive(self, message: Message) -> None:
         """Pass a message to the handler, or record that all retained messages have arrived.
