@@ -12,16 +12,18 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 #: A player that reads sound in real time, buffers 60 ms, and writes it to the file named by its first argument.
+#: The second argument is the sample rate, if it isn't 22,050.
 PLAYS = """
 import os, sys, time
 heard = open(sys.argv[1], "ab", buffering=0)
 started_at, taken = None, 0
-while data := os.read(0, 882):
+bytes_per_s = 2 * int(sys.argv[2]) if len(sys.argv) > 2 else 44100
+while data := os.read(0, bytes_per_s // 100 * 2):
     started_at = started_at or time.monotonic()
     taken += len(data)
     heard.write(data)
     {during}
-    time.sleep(max(0, started_at + taken / 44100 - 0.06 - time.monotonic()))
+    time.sleep(max(0, started_at + taken / bytes_per_s - 0.06 - time.monotonic()))
 time.sleep(0.06)
 {after}
 """

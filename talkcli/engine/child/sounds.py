@@ -34,8 +34,6 @@ _TONE_LEVEL = 11_000
 _OCTAVE_LEVEL = 0.3
 #: How long a tone takes to become loud. Without this, a click would be heard.
 _ATTACK_S = 0.008
-#: Lowest sample rate for a player. At a lower rate, a program's pipe holds too much sound for a quick pause.
-_MIN_PLAYER_RATE = 16_000
 
 
 def play_sound(library: SoundLibrary, command: Speak, playback: Playback, required_rate: int | None) -> float:
@@ -56,7 +54,8 @@ def play_sound(library: SoundLibrary, command: Speak, playback: Playback, requir
         raise CannotSpeak(error.reason, str(error)) from error
     try:
         rate, pieces = (file.rate, _read_samples(file)) if file else (DEFAULT_RATE_HZ, _make_tones(command.text))
-        player_rate = required_rate or rate * math.ceil(_MIN_PLAYER_RATE / rate)
+        # At a lower rate than that of speech, a program's pipe would hold too much sound for an exact pause.
+        player_rate = required_rate or rate * math.ceil(DEFAULT_RATE_HZ / rate)
         playback.begin_sound(player_rate)
         skipped, count = command.start, 0  # the samples before an interruption are skipped
         for piece in pieces if player_rate == rate else resample(pieces, rate, player_rate):
