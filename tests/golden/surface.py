@@ -50,7 +50,9 @@ ERRORS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("status", ("", "a b", "''")),
     ("", ("--json status",)),
     ("watch", ("", "now")),
-    ("log", ("", "-n 0", "-n 2201")),
+    ("log", (
+        "", "-n 0", "-n 2201", "--since 5d", "--since 2h --until 3h", "--since 2099-01-01", "--as ''",
+    )),
     ("set", ("", "--rate 5", "--ttl -1", "--preempt --no-preempt --rate x")),
     ("pause", ("", "now", "--while", "--while ls -l", "--while -- ls", "--for 25h", "--robot anna --while -- ls")),
     ("resume", ("",)),
@@ -58,7 +60,7 @@ ERRORS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("serve", (
         "--rate 5", "--volume 2", "--pitch -1", "--max-queue 0", "--max-text 10001", "--max-clients 0",
         "--lead-in 5001", "--socket-mode 0888", "--socket-mode 0066", "--player null --device x", "--player file:",
-        "--player null --driver parrot", "--print-unit nonsense", "now",
+        "--player null --driver parrot", "--print-unit nonsense", "--history notext", "now",
     )),
     ("completion", ("", "tcsh")),
     ("doctor", ("now",)),
@@ -105,6 +107,8 @@ REQUESTS: tuple[dict[str, Any], ...] = (
     {"seq": 32, "request": "wait", "ids": ["a/1"], "feedback": True},
     {"seq": 33, "request": "log", "count": 3},
     {"seq": 34, "request": "log", "count": 0},
+    {"seq": 34, "request": "log", "history": True, "grep": "one", "state": "SUCCEEDED", "since": 1, "until": 1e12},
+    {"seq": 34, "request": "log", "state": "LOST"},
     {"seq": 35, "request": "cancel"},
 )
 

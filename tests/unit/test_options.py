@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import ast
+import datetime as dt
 import importlib
 import inspect
 import math
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,6 +31,7 @@ from talkcli.goals.options import (
     INTEGER,
     MAX_KEY_CHARS,
     MAX_PRIORITY,
+    MOMENT,
     NUMBER,
     OPTIONS,
     SECONDS,
@@ -343,6 +346,7 @@ def test_limits_are_the_same_on_the_wire_and_on_the_command_line() -> None:
             read_value(option, "abc")
 
 
+SINCE = Option("since", MOMENT)
 TTL, LEAD_IN, LIMIT = ROWS["ttl"], ROWS["lead_in"], Option("x", TIME_LIMIT, limits=(0, None))
 
 
@@ -364,6 +368,49 @@ def test_a_time_may_have_a_unit(option: Option, values: dict[str, float], malfor
     for text in (*malformed.split(), ""):
         with pytest.raises(ValueError, match="must "):
             read_value(option, text)
+
+
+@pytest.mark.parametrize(
+    ("text", "days_ago", "clock"),
+    [
+        ("14:00", 0, "14:00:00"),
+        ("0:05:59", 0, "00:05:59"),
+        ("today", 0, "00:00:00"),
+        ("yesterday", 1, "00:00:00"),
+        ("yesterday 23:59", 1, "23:59:00"),
+    ],
+)
+def test_a_point_in_time_is_local(text: str, days_ago: int, clock: str) -> None:
+    before = dt.date.today()
+    read = dt.datetime.fromtimestamp(read_value(SINCE, text))
+    assert str(read.time()) == clock
+    assert read.date() + dt.timedelta(days_ago) in {before, dt.date.today()}
+
+
+def test_a_point_in_time_may_have_a_date_or_be_before_now() -> None:
+    for text in ("2026-11-24 14:00", "2026-3-9 2:07:08", "2026-11-24"):
+        day, _, clock = text.partition(" ")
+        parts = [*map(int, (*day.split("-"), *filter(None, clock.split(":"))))]
+        assert read_value(SINCE, text) == dt.datetime(*parts).timestamp()  # type: ignore[arg-type]
+    for text, seconds in {"2h": 7200, "90m": 5400, "500ms": 0.5}.items():
+        before = time.time() - seconds
+        assert before - 0.001 <= read_value(SINCE, text) <= time.time() - seconds + 0.001
+    for text in (
+        "",
+        " ",
+        "14",
+        "25:00",
+        "14:60",
+        "2026-02-30",
+        "tomorrow",
+        "5d",
+        "h",
+        "infh",
+        "today 14",
+        "14:00 today",
+    ):
+        with pytest.raises(ValueError, match="must be a time such as 2h, 14:00, yesterday or '2026-11-24 14:00', got"):
+            read_value(SINCE, text)
 
 
 def test_a_plain_command_line_is_parsed_without_compiling_options() -> None:
