@@ -84,6 +84,8 @@ def test_a_growing_text_in_two_pieces_is_said_as_a_whole(make_talk: MakeTalk, na
         grown = stream.goal.wait(20)
         assert grown.state is State.SUCCEEDED
         assert grown.duration == pytest.approx(whole.goal.duration, abs=0.05)
+        plain = client.say(SAID.replace("[[tS'A@dZ3]]", "charger."), rate=450).wait(20)
+        assert plain.duration == pytest.approx(grown.duration, abs=0.05)
         assert client.goal(grown.id).said == client.goal(whole.id).said == SAID + " ."
         assert [(each.start, each.end) for each in stream.goal.feedback(1)] == words
 

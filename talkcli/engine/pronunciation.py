@@ -39,7 +39,7 @@ _UNSPEAKABLE = re.compile("[\0-\b\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
 _LETTER = r"(?:[^\W\u2e80-\U0010ffff]|[\u0300-\u036f])"
 #: A place where a word may begin or end. Numbers such as "2.5" count as one word.
 _BORDER = rf"(?:(?<!{_LETTER})|(?!{_LETTER}))(?!(?<=\d)[.,:]\d)(?<!\d[.,:](?=\d))"
-#: A word, or any other visible character, with which a term may begin
+#: A word, or any other visible character, with which a term may begin.
 _FIRST_WORD = re.compile(rf"{_LETTER}+|\S")
 #: A blank between two words of a term, which is not the end of a paragraph.
 _GAP = r"(?:(?!\n\s*\n)\s)+"
@@ -66,7 +66,6 @@ class SpokenText:
         #: for each section of the new text: where it begins there and in the text that was sent, and the length of the
         #: term that it replaces, or 0
         self._sections: list[tuple[int, int, int]] = []
-        self._last_term = -1
         self.text, self.end = "", start
         kept = text.translate(_WITHOUT_BRACKETS) if self.has_phonemes else text
         for term_start, term_end, replacement in replacements:
@@ -88,16 +87,11 @@ class SpokenText:
         self._sections.append((len(self.text), start, term_chars))
         self.text += text
 
-    def locate(self, start: int, length: int) -> tuple[int, int] | None:
-        """Return the place and length in the sent text of a word of the spoken text.
-
-        A replaced term is located only once, even if it is spoken as several words. After that, return None.
-        """
-        section = self._find_section(start)
-        begin, original, term_chars = self._sections[section]
+    def locate(self, start: int, length: int) -> tuple[int, int]:
+        """Return the place and length in the sent text of a word of the spoken text. A replaced term is one word."""
+        begin, original, term_chars = self._sections[self._find_section(start)]
         if term_chars:
-            is_new, self._last_term = section != self._last_term, section
-            return (original, term_chars) if is_new else None
+            return original, term_chars
         place, last = original + start - begin, start + length - 1
         begin, original, term_chars = self._sections[self._find_section(last)]
         return place, original + (term_chars or last - begin + 1) - place

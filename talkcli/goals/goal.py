@@ -110,7 +110,7 @@ class Goal:
     #: human-readable description of how the goal ended
     message: str | None = None
     format: str = "text"
-    #: text as it is said, if that differs from `text`; only set in replies about a single goal
+    #: text as it is said, if that differs from `text`; only set in replies about one goal and in goals from the history
     said: str | None = None
     #: text up to the end of the last word that has started
     spoken: str | None = None

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.engine import protocol
+from talkcli.frozen import replace
 from tests.engine.process import FAST, Engine
 from tests.support import tiny_voice
 from tests.support.real_voice import REAL_VOICE, link_without_noise, real_voice
@@ -27,6 +28,7 @@ TEXTS = [
     "The charger of the robot is at the door, near the turbine.",
     "Xylophor! Charger? (robot) “turbine”; robot's, robot-arm: the charger's cable.",
     "A [[h@'loU]] charger [1], Mr. Robot takes 1,000 chargers to the U.S.A. robot",
+    "Type talk --robot and go-charger, robot_x robot-",
     "charger robot turbine Xylophor\n\n\tcharger, é turbine.",
 ]
 
@@ -50,14 +52,12 @@ def engine(voice: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Eng
 
 
 def speak(
-    engine: Engine, voice: str, *pieces: str, goal: str, terms: dict[str, str] | None = None
+    engine: Engine, voice: str, *pieces: str, goal: str, terms: dict[str, str] | None = None, start: int = 0
 ) -> tuple[list[tuple[int, int]], float]:
     """Speak a text that arrives in pieces. Return the places of its words, and the length of the sound."""
     id_ = {"espeak": None, "tiny": "piper/tiny", "joe": REAL_VOICE}[voice]
-    more = len(pieces) > 1
-    engine.send(
-        protocol.Speak(goal, pieces[0], FAST, 1.0, id_, 50, voice_only=bool(id_), more=more, pronunciations=terms)
-    )
+    first = protocol.Speak(goal, pieces[0], FAST, 1.0, id_, 50, voice_only=bool(id_), pronunciations=terms, start=start)
+    engine.send(replace(first, more=len(pieces) > 1))
     for piece in pieces[1:]:
         engine.send(protocol.Append(goal, piece, end=piece is pieces[-1]))
     ended = engine.until(protocol.Ended)
@@ -92,7 +92,17 @@ def test_a_text_sounds_like_its_replacement(engine: Engine, voice: str, text: st
     assert abs(before - expected) > 0.05
 
 
-def test_a_term_is_one_word_even_if_it_contains_the_end_of_a_sentence(engine: Engine, voice: str) -> None:
-    for goal, pieces in (("whole term", ["Stop! Go now. ROS 2."]), ("grown term", ["Stop! Go now. RO", "S 2.", ""])):
-        words, _ = speak(engine, voice, *pieces, goal=goal, terms=TERMS)
-        assert words == [(0, 4), (9, 12), (14, 17)]
+def test_a_term_is_one_word_even_if_it_contains_the_end_of_a_sentence(engine: Engine) -> None:
+    engine.send(protocol.Speak("parts", "Stop! Go now. RO", FAST, 1.0, None, 50, more=True, pronunciations=TERMS))
+    engine.until(protocol.Word)  # the first sentence is spoken before the rest arrives
+    engine.send(protocol.Append("parts", "S 2.", end=True))
+    assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
+    assert [(word.start, word.end) for word in engine.words("parts")] == [(0, 4), (9, 12), (14, 17)]
+
+
+def test_the_rest_of_an_interrupted_text_has_the_same_words(engine: Engine, voice: str) -> None:
+    text = "The charger of (Xylophor) is ROS 2, robot's turbine."
+    words, _ = speak(engine, voice, text, goal="uninterrupted", terms=TERMS)
+    for number, (start, _) in enumerate(words):
+        rest = speak(engine, voice, text, goal=f"rest {number}", terms=TERMS, start=start)[0]
+        assert rest == words[number:]

@@ -67,7 +67,7 @@ WORDS = st.sampled_from(["ROS", "2", "ROS 2", "charger", "GmbH", "a", "é", "[",
 def test_each_word_of_the_spoken_text_is_located_in_the_sent_text(text: str, start: int, length: int) -> None:
     end = min(len(text), start + length)
     spoken = Pronunciations(TERMS).apply(text, min(start, end), end)
-    places = [(spoken.text[at], place) for at in range(len(spoken.text)) if (place := spoken.locate(at, 1))]
+    places = [(said, spoken.locate(at, 1)) for at, said in enumerate(spoken.text)]
     assert places == sorted(places, key=lambda each: each[1])
     kept = [(said, text[place]) for said, (place, chars) in places if chars == 1 and not said.isspace()]
     assert [said.translate(BRACKETS) for said, _ in kept] == [sent.translate(BRACKETS) for _, sent in kept]

@@ -347,7 +347,7 @@ class Playback:
         """
         self._samples.audible = True
         located = self._part.locate(start, length) if self._part else (start, length)
-        if located and (found := self._runner.find_word(*located)):
+        if found := self._runner.find_word(*located):
             self._clock.add(TimedWord(*found, self._seconds(self._part_begin) + audio_start))
 
     def write(self, samples: bytes) -> None:
