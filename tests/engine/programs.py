@@ -17,7 +17,7 @@ PLAYS = """
 import os, sys, time
 heard = open(sys.argv[1], "ab", buffering=0)
 started_at, taken = None, 0
-bytes_per_s = 2 * int(sys.argv[2]) if len(sys.argv) > 2 else 44100
+bytes_per_s = 2 * int(sys.argv[2]) if sys.argv[2:] and sys.argv[2].isdigit() else 44100
 while data := os.read(0, bytes_per_s // 100 * 2):
     started_at = started_at or time.monotonic()
     taken += len(data)
