@@ -12,7 +12,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -28,6 +28,7 @@ from tests.support.compare import assert_silent, extent
 from tests.support.processes import Talk, run_talk
 from tests.support.real_voice import REAL_PACKAGE
 from tests.support.surroundings import clean_environment, needs
+from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -65,13 +66,13 @@ def robot(server: Talk) -> Iterator[Talk]:
     server.request("set", volume=1.0)
 
 
-def doctor(env: Mapping[str, str], *options: str, code: int = 4) -> dict[str, dict[str, str]]:
+def doctor(env: Mapping[str, str], *options: str, code: int = 4) -> dict[str, dict[str, Any]]:
     """Run the doctor, and return its findings by name of the check."""
     ended, out, err = run_talk(["--json", "doctor", *options], env, LIMIT_S)
     assert (ended, err) == (code, ""), out
     findings = [json.loads(line) for line in out.splitlines()]
     for finding in findings:
-        assert list(finding) == ["check", "state", "message", "next"]
+        assert list(finding) == ["check", "state", "message", "next", "measured"]
         assert finding["state"] in {"ok", "warning", "failed"}
         assert (finding["next"] is None) == (finding["state"] == "ok"), finding
     assert [findings[index]["check"] for index in (0, -1)] == ["python", "sentence"]
@@ -104,9 +105,24 @@ def test_without_faults_the_doctors_sentence_is_heard(robot: Talk, sink: Sink) -
     assert f"{robot.socket} (TALK_SOCKET, process {robot.pid})" in findings["socket"]["message"]
     assert "plays to null" in findings["sound server"]["message"]
     assert "through the server, pulse" in findings["sentence"]["message"]
-    goal = logged(robot)[-1]
+    goal, stopped = logged(robot)[-2:]
     assert (goal["text"], goal["state"], goal["client"]["name"]) == (SENTENCE_TEXT, "SUCCEEDED", "talk doctor")
+    assert (stopped["text"], stopped["state"]) == (sentence.STOP_TEXT, "PREEMPTED")
     assert extent(recording.samples)
+    measured = findings["sentence"]["measured"]
+    assert 0 <= measured["stop_ms"] <= 2000
+    assert f"the sound began {measured['onset_ms']} ms after the request" in findings["sentence"]["message"]
+
+
+def test_the_onset_of_the_sentence_is_the_time_of_its_first_sound(robot: Talk, sink: Sink) -> None:
+    with limits(), Client(robot.socket) as client, sink.record() as recording:
+        asked_at = time.monotonic()
+        played = sentence.speak_by_server(client, SENTENCE_TEXT, LIMIT_S)
+        recording.wait_until_quiet(0.1)
+        onset, first_sound = played.onset_s, recording.first_sound()
+        assert onset is not None
+        assert first_sound is not None
+        assert_within(abs(asked_at + onset - first_sound), 0.1, "the first sound, compared with the reported onset")
 
 
 def test_silent_makes_no_sound_and_shows_one_finding_per_line(robot: Talk, sink: Sink) -> None:
@@ -293,6 +309,7 @@ def test_without_a_server_the_doctors_own_engine_is_heard(home: str, sink: Sink)
     assert {finding["check"] for finding in findings.values() if finding["state"] == "failed"} == {"socket"}
     assert findings["socket"]["next"] == "unset TALK_SOCKET, or start a server there: talk serve"
     assert "by talk doctor's own engine, pulse" in findings["sentence"]["message"]
+    assert min(findings["sentence"]["measured"].values()) >= 0
     assert "server" not in findings
 
 

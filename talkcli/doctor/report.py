@@ -39,6 +39,8 @@ class Finding:
     message: str
     #: what the user should do next, or None if nothing is wrong
     next: str | None = None
+    #: the times that the check measured, such as `onset_ms`; None if it measures nothing
+    measured: dict[str, int | None] | None = None
 
 
 @frozen
@@ -58,9 +60,9 @@ ROBOT_QUESTION = Question("the robot answers", "the robot can't be reached")
 BRIDGE_QUESTION = Question("the broker accepts this robot's messages", "the broker would not accept these messages")
 
 
-def ok(check: str, message: str) -> Finding:
+def ok(check: str, message: str, measured: dict[str, int | None] | None = None) -> Finding:
     """Return a finding for a check that passed."""
-    return Finding(check, OK, printable(message))
+    return Finding(check, OK, printable(message), measured=measured)
 
 
 def warning(check: str, message: str, step: str) -> Finding:

@@ -1,11 +1,13 @@
 """The check that speaks a sentence through the server or the doctor's own engine.
 
-The server treats the sentence like any other goal.
+The server treats the sentence like any other goal. After it was played, another sentence at volume 0 is cancelled at
+its first word, to measure how long a stop takes.
 """
 
 from __future__ import annotations
 
 import contextlib
+import time
 from typing import TYPE_CHECKING
 
 from talkcli.doctor.report import Finding, failure, ok
@@ -13,6 +15,7 @@ from talkcli.doctor.sound import START_SOUND_SERVER, is_custom_command
 from talkcli.doctor.voice import INSTALL_LIBRARY, SENTENCE_RATE_WPM, SENTENCE_TEXT, explain_failure, start_engine
 from talkcli.engine import protocol
 from talkcli.engine.parent.process import EngineFailed
+from talkcli.engine.players import is_silent
 from talkcli.errors import TalkError
 from talkcli.frozen import frozen, replace
 from talkcli.goals.goal import message_details
@@ -27,12 +30,16 @@ if TYPE_CHECKING:
     from talkcli.client.client import Client
     from talkcli.client.goal import GoalHandle
     from talkcli.doctor.voice import EngineOptions
+    from talkcli.engine.parent.process import PrivateEngine
     from talkcli.goals.goal import Goal
 
 _SENTENCE_CHECK = "sentence"
 #: The sentence to play silently beside a running server. It is short, because some devices accept only one player at a
 #: time, but long enough to show whether the player works.
 SILENT_TEXT, _SILENT_RATE_WPM = "talk works well", 450
+#: The silent sentence that is cancelled at its first word. Its text is in the log of goals. If its first word isn't
+#: spoken within this many seconds, the stop is not measured.
+STOP_TEXT, _STOP_LIMIT_S = "talk doctor cancels this silent sentence", 2.0
 #: Advice for each reason why a goal can end. The reasons "late" and "paused" are only used by the doctor. A test checks
 #: that each reason for aborting a goal has advice.
 ADVICE: dict[str, str] = {
@@ -95,6 +102,10 @@ class SentenceResult:
     suspended: tuple[str, ...] = ()
     #: the device that played the sentence while it was muted, or None
     muted_device: str | None = None
+    #: seconds from the request to the first sound, or None if unknown
+    onset_s: float | None = None
+    #: seconds from a cancel to silence, or None if unknown
+    stop_s: float | None = None
 
 
 def speak_by_server(client: Client, text: str, limit: float) -> SentenceResult:
@@ -103,13 +114,18 @@ def speak_by_server(client: Client, text: str, limit: float) -> SentenceResult:
     Cancel it after `limit` seconds.
     """
     try:
-        goal = client.say(text, preempt=False, ttl=0)
+        asked_at = time.monotonic()
+        goal = client.say(text, preempt=False, ttl=0, feedback=True)
         try:
             if goal.speech_paused:
                 return SentenceResult(goal.cancel().state, "paused", f"not spoken: {describe_pause(goal.pause)}")
+            # The time of a word counts from the first sound.
+            onsets = [time.monotonic() - word.time - asked_at for word in goal.feedback(limit)]
             result = _convert_ended_goal(goal.wait(limit))
             with contextlib.suppress(TalkError):  # the result is valid even if the server ends now
                 result = replace(result, player=client.status().server.get("player"))
+                if result.state is State.SUCCEEDED and onsets and not is_silent(result.player):
+                    result = replace(result, onset_s=onsets[0], stop_s=_time_server_stop(client))
             return result
         except TimeoutError:
             return _cancel_late_goal(client, goal, limit)
@@ -118,6 +134,19 @@ def speak_by_server(client: Client, text: str, limit: float) -> SentenceResult:
             raise
     except TalkError as error:
         return SentenceResult(State.LOST, Reason.LOST, error.message)
+
+
+def _time_server_stop(client: Client) -> float | None:
+    """Cancel a silent sentence at its first word. Return how many seconds the server needed to stop it.
+
+    Return None if the sentence was not spoken.
+    """
+    saying = client.saying(STOP_TEXT, preempt=False, ttl=_STOP_LIMIT_S, volume=0.0, audible=False, feedback=True)
+    canceled_at = None
+    with contextlib.suppress(TimeoutError), saying as goal:
+        if next(goal.feedback(_STOP_LIMIT_S), None) is not None:
+            canceled_at = time.monotonic()
+    return time.monotonic() - canceled_at if canceled_at and goal.state is State.PREEMPTED else None
 
 
 def _cancel_late_goal(client: Client, goal: GoalHandle, limit: float) -> SentenceResult:
@@ -163,21 +192,48 @@ def speak_beside_server(client: Client, options: EngineOptions, limit: float) ->
 def speak_by_engine(text: str, options: EngineOptions, volume: float, limit: float) -> SentenceResult:
     """Speak a sentence with the doctor's own engine. Return how it ended.
 
-    Give up after `limit` seconds.
+    Give up after `limit` seconds. Times are measured unless the volume is 0.
     """
     try:
         with start_engine(options, limit) as engine:
             player = engine.wait_for(protocol.Ready).player
             rate = SENTENCE_RATE_WPM if volume else _SILENT_RATE_WPM
+            asked_at = time.monotonic()
             engine.speak(protocol.Speak("doctor", text, rate, volume, options.voice, 50))
-            ended = engine.wait_for(protocol.Ended)
+            first = _await_word(engine)
+            onset = time.monotonic() - first.time - asked_at if isinstance(first, protocol.Word) else None
+            ended = engine.wait_for(protocol.Ended) if isinstance(first, protocol.Word) else first
             if ended.outcome == protocol.OUTCOME_COMPLETED:
-                return SentenceResult(State.SUCCEEDED, duration=ended.duration, player=ended.player or player)
+                player = ended.player or player
+                result = SentenceResult(State.SUCCEEDED, duration=ended.duration, player=player)
+                if volume and onset is not None and not is_silent(player):
+                    result = replace(result, onset_s=onset, stop_s=_time_engine_stop(engine, options))
+                return result
             return SentenceResult(State.ABORTED, ended.reason, ended.message or ended.outcome, player=player)
     except EngineFailed as error:
         return SentenceResult(State.ABORTED, *explain_failure(error))
     except TimeoutError:
         return SentenceResult(State.ABORTED, Reason.ENGINE_HUNG, f"the sentence did not end within {limit:g} s")
+
+
+def _await_word(engine: PrivateEngine) -> protocol.Word | protocol.Ended:
+    """Wait for the next word of the engine's sentence, or for the sentence's end. Return the event."""
+    return next(each for each in engine.events if isinstance(each, protocol.Word | protocol.Ended))
+
+
+def _time_engine_stop(engine: PrivateEngine, options: EngineOptions) -> float | None:
+    """Stop a silent sentence at its first word. Return how many seconds the engine needed to stop it.
+
+    Return None if the sentence was not spoken.
+    """
+    with contextlib.suppress(EngineFailed, TimeoutError):
+        engine.speak(protocol.Speak("stop", STOP_TEXT, SENTENCE_RATE_WPM, 0.0, options.voice, 50))
+        if isinstance(_await_word(engine), protocol.Word):
+            stopped_at = time.monotonic()
+            engine.stop("stop")
+            if engine.wait_for(protocol.Ended).outcome == protocol.OUTCOME_STOPPED:
+                return time.monotonic() - stopped_at
+    return None
 
 
 def find_playback_step(findings: Sequence[Finding], *, custom_player: bool = False) -> str | None:
@@ -244,7 +300,10 @@ def judge_sentence(
         seconds = "" if result.duration is None else f", {result.duration:.1f} s"
         player = f", {result.player}" if result.player else ""
         said = "a sentence was played without sound" if silent else f'"{SENTENCE_TEXT}" was played to the end'
-        return ok(_SENTENCE_CHECK, f"{said} {how}{player}{seconds}")
+        onset, stop = (None if each is None else round(1000 * each) for each in (result.onset_s, result.stop_s))
+        times = "" if onset is None else f"; the sound began {onset} ms after the request"
+        times += "" if stop is None else f", and stops {stop} ms after a cancel"
+        return ok(_SENTENCE_CHECK, f"{said} {how}{player}{seconds}{times}", {"onset_ms": onset, "stop_ms": stop})
     if result.reason in {"late", "paused"}:
         return failure(_SENTENCE_CHECK, result.message or "", ADVICE[result.reason])
     message = message_details(result.message) or "no reason was given"

@@ -53,7 +53,7 @@ def findings(done: Finished, code: int) -> dict[str, dict[str, str]]:
     assert (done.code, done.err) == (code, ""), done
     results = [json.loads(line) for line in done.out.splitlines()]
     for finding in results:
-        assert list(finding) == ["check", "state", "message", "next"]
+        assert list(finding) == ["check", "state", "message", "next", "measured"]
     return {finding["check"]: finding for finding in results}
 
 

@@ -362,6 +362,10 @@ def test_the_result_of_the_sentence_is_shown_with_the_next_step() -> None:
     finding = sentence.judge_sentence(played, silent=False, device=None)
     assert finding.state == OK
     assert finding.message.endswith("was played to the end through the server, aplay, 1.7 s")
+    assert finding.measured == {"onset_ms": None, "stop_ms": None}
+    finding = sentence.judge_sentence(replace(played, onset_s=0.0174, stop_s=0.013), silent=False, device=None)
+    assert finding.message.endswith(", 1.7 s; the sound began 17 ms after the request, and stops 13 ms after a cancel")
+    assert finding.measured == {"onset_ms": 17, "stop_ms": 13}
     assert "a sentence was played without sound" in sentence.judge_sentence(played, silent=True, device=None).message
     for beginning in ("speech failed: ", "Talk aborted: ", ""):  # older servers send the second one
         message = f"{beginning}aplay: audio open error: Permission denied"

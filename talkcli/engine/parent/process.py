@@ -255,6 +255,10 @@ class PrivateEngine(contextlib.AbstractContextManager["PrivateEngine"]):
         self._last_event_at = time.monotonic()
         self._process.send(command)  # if this fails, `wait_for` raises an error
 
+    def stop(self, goal_id: str) -> None:
+        """Tell the process to stop speaking this goal."""
+        self._process.send(protocol.Stop(goal_id))
+
     def wait_for(self, event_class: type[_E]) -> _E:
         """Wait for the next event of the given class. Return the event.
 
