@@ -230,7 +230,7 @@ def untouched() -> Iterator[Client]:
         talk.stop()
 
 
-ROWS = [option for option in OPTIONS if option.name not in {"wait", "more", "stall"}]
+ROWS = [option for option in OPTIONS if option.name not in {"wait", "more", "stall", "dry_run"}]
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda option: option.name)
