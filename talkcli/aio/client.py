@@ -125,7 +125,8 @@ class Saying(SayingCalls):
 class Client(ClientCalls):
     """A client for asyncio, which connects at the beginning of an `async with` block, or with `connect`.
 
-    Use it in the event loop in which it was connected. It reconnects like the blocking client.
+    Use it in the event loop in which it was connected. It reconnects like the blocking client. The documentation of
+    `talkcli.Client` describes the parameters and the errors of its calls.
     """
 
     def __init__(self, socket: str | None = None, *, name: str | None = None, timeout: float = ANSWER_LIMIT_S) -> None:
@@ -157,8 +158,8 @@ class Client(ClientCalls):
     async def say(self, *text: str, **options: Any) -> GoalHandle:
         """Send a text to be spoken. Return the handle of its goal.
 
-        If the task is cancelled during this call, the text may be spoken nevertheless. To end it then, too, use
-        `saying`, or choose the `key` or the `id`.
+        If the task is cancelled during this call, the text may still be spoken. To be able to cancel it, use `saying`,
+        or choose its `key` or `id`.
         """
         return await self._say(GoalHandle, *text, **options)
 
@@ -197,8 +198,10 @@ class Client(ClientCalls):
         while True:
             yield await next_event()
 
-    def __getattr__(self, name: str) -> Any:
-        """Explain that a client is not connected, if its connection is missing."""
-        if name == "_connection":
-            raise UsageError("this client is not connected; use it as in: async with Client() as talk")
-        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+    if not TYPE_CHECKING:  # type checkers would accept any name
+
+        def __getattr__(self, name: str) -> Any:
+            """Explain that a client is not connected, if its connection is missing."""
+            if name == "_connection":
+                raise UsageError("this client is not connected; use it as in: async with Client() as talk")
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
