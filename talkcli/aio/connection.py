@@ -157,6 +157,7 @@ class LoopConnection(Connection):
 
     def _run(self) -> None:
         """Process the messages that have arrived, enforce time limits, and watch the descriptors again."""
+        self._watch = None  # it has ended
         try:
             late = time.monotonic() >= self._limit  # messages that have already arrived are processed first
             self._step(0.0, interruptible=False)
@@ -172,8 +173,6 @@ class LoopConnection(Connection):
             self.end(f"a bug in the connection: {type(error).__name__}: {error}")
             self._end_waits(NEVER)
             raise  # the event loop reports it
-        finally:
-            self._watch = None
         if self.ended is None:
             deadlines = [deadline for future, (_, deadline, _) in self._waits.items() if not future.done()]
             self._limit = min(self.next_expiry(), self.silence_deadline(since)[0], *deadlines)
