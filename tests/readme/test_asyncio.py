@@ -89,12 +89,11 @@ def test_the_web_endpoint_answers_when_the_text_was_spoken(scripted_shell: Shell
 
 @runs("A supervisor")
 def test_a_supervisor_cancels_what_takes_too_long(scripted: Talk) -> None:
-    code = changed("A supervisor", ("please hold on", "never-ends hold on"), ("seconds=5", "seconds=1"))
-    assert run(code, scripted.env) == [
-        "the doors are closing: SUCCEEDED",
-        "never-ends hold on: PREEMPTED",
-        "the next stop is the market: RECALLED",
-    ]
+    code = changed("A supervisor", ("please hold on", "never-ends hold on"), ("seconds=5", "seconds=2"))
+    *first, last = run(code, scripted.env)
+    assert first == ["the doors are closing: SUCCEEDED", "never-ends hold on: PREEMPTED"]
+    # Both cancels are sent at the same time, so the last goal may just have begun.
+    assert last in {f"the next stop is the market: {state}" for state in ("RECALLED", "PREEMPTED")}
 
 
 @runs("A fleet")
