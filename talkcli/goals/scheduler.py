@@ -945,14 +945,12 @@ class Scheduler:
 
     def _find_interjection(self, priority: int) -> Record | None:
         """Return the first waiting interjection with at least this priority, if any. Its voice must be usable now."""
-        return next(
-            (
-                each
-                for each in self.pending.interjections()
-                if each.say.priority >= priority and self._start_time(each) < inf
-            ),
-            None,
-        )
+        for each in self.pending.interjections():
+            if each.say.priority < priority:
+                break
+            if self._start_time(each) < inf:
+                return each
+        return None
 
     def _interrupt_active(self) -> list[Effect]:
         """Interrupt the active goal if an interjection is waiting for that. Return the order, if any.

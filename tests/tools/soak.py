@@ -95,6 +95,14 @@ class Soak:
         clients = self._start_senders("")
         narrator = Narrator(self._talk, self._sink, faults.calm_since)
         clients.start("narrator", narrator.run)
+        told: Counter[tuple[str, bool]] = Counter()
+        interjected: Counter[str] = Counter()
+        # They have a high priority, so they would delay the warm-up.
+        rng = random.Random(f"{self._seed} stories")
+        clients.start("stories", partial(tell_stories, self._talk, self._stories, told, rng))
+        for number in range(_INTERJECTING_CLIENTS):
+            rng = random.Random(f"{self._seed} interjections {number}")
+            clients.start(f"interjections {number}", partial(interject, self._talk, interjected, rng))
         end = time.monotonic() + seconds
 
         def over() -> bool:
@@ -108,18 +116,11 @@ class Soak:
                 faults.run(every, over)
         finally:
             clients.stop(f"after {faults.done}; last fault: {faults.last}")
-        return Report(Counter(), faults.done, narrator.heard_whole, self._grown, self._told, self._interjected)
+        return Report(Counter(), faults.done, narrator.heard_whole, self._grown, told, interjected)
 
     def _start_senders(self, phase: str) -> Workers:
         workers = Workers()
         self._grown: Counter[tuple[str, str]] = Counter()
-        self._told: Counter[tuple[str, bool]] = Counter()
-        self._interjected: Counter[str] = Counter()
-        rng = random.Random(f"{self._seed} {phase} stories")
-        workers.start("stories", partial(tell_stories, self._talk, self._stories, self._told, rng))
-        for number in range(_INTERJECTING_CLIENTS):
-            rng = random.Random(f"{self._seed} {phase} interjections {number}")
-            workers.start(f"interjections {number}", partial(interject, self._talk, self._interjected, rng))
         for number in range(_CLIENTS + _GROWING_CLIENTS):
             rng = random.Random(f"{self._seed} {phase} {number}")
             send = partial(send_goals, self._talk)
