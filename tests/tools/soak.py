@@ -28,7 +28,7 @@ from tests.tools.soak_faults import RobotFaults
 from tests.tools.soak_growing import send_growing_texts
 from tests.tools.soak_interjecting import interject, read_stories, tell_stories
 
-#: Clients that send usual goals, clients that send growing texts, and clients that send interjections.
+#: Clients that send usual goals, and that send growing texts, and pairs of clients of which one interrupts the other.
 _CLIENTS, _GROWING_CLIENTS, _INTERJECTING_CLIENTS = 8, 3, 2
 #: Goals before the first count of resources. By then, the history is almost full, and all code has run once.
 _WARM_UP_GOALS = 1_200
@@ -49,6 +49,7 @@ class Report:
     #: interrupted texts by state, and whether they were interrupted
     stories: Counter[tuple[str, bool]] = field(default_factory=Counter)
     interjections: Counter[str] = field(default_factory=Counter)  # by state
+    interruptions: int = 0  # of all goals
 
 
 class Soak:
@@ -74,7 +75,7 @@ class Soak:
         self._settle()
         before, files, known = usage.count(talk.pid), self._files(), Counter(monitor.ends)
         report = self._disturb(seconds, every, min_faults)
-        report.ends = monitor.ends - known
+        report.ends, report.interruptions = monitor.ends - known, monitor.interruptions
         lost = sum(
             count for (state, reason), count in report.ends.items() if state == "ABORTED" and reason in _ENGINE_REASONS
         )
@@ -98,9 +99,9 @@ class Soak:
         told: Counter[tuple[str, bool]] = Counter()
         interjected: Counter[str] = Counter()
         # They have a high priority, so they would delay the warm-up.
-        rng = random.Random(f"{self._seed} stories")
-        clients.start("stories", partial(tell_stories, self._talk, self._stories, told, rng))
         for number in range(_INTERJECTING_CLIENTS):
+            rng = random.Random(f"{self._seed} stories {number}")
+            clients.start(f"stories {number}", partial(tell_stories, self._talk, self._stories, told, rng))
             rng = random.Random(f"{self._seed} interjections {number}")
             clients.start(f"interjections {number}", partial(interject, self._talk, interjected, rng))
         end = time.monotonic() + seconds

@@ -102,7 +102,7 @@ def _check(goal: Message, words: list[tuple[int, int, int]], wanted: list[tuple[
 def interject(talk: Talk, ends: Counter[str], rng: random.Random, over: threading.Event) -> None:
     """Interrupt whatever is spoken. `ends` counts the interjections by their final state."""
     with talk.connect() as wire:
-        while not over.wait(rng.random() * 0.5):
+        while not over.wait(rng.random() * 2):
             priority = rng.choice((_PRIORITY, _PRIORITY, _PRIORITY + 1))
             text = rng.choice(("step aside", "excuse me, please", "no"))
             goal = wire.request("say", text=text, interject=True, priority=priority, rate=_RATE, wait=True)["goal"]
