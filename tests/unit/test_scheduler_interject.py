@@ -177,11 +177,6 @@ def test_at_most_eight_goals_are_interrupted_and_the_next_interjection_waits() -
     assert robot.outcome() == "a b c d e f g h i j SUCCEEDED"
 
 
-def test_a_sound_is_not_interrupted() -> None:
-    robot = play("a format=sound; b; c interject; completed a")
-    assert (robot.outcome(), "a Interrupt" in robot.seen) == ("c ACTIVE; b PENDING; a SUCCEEDED", False)
-
-
 def test_nothing_is_interrupted_that_is_written_to_a_file() -> None:
     robot = Robot()
     robot.scheduler = Scheduler("4k7f", max_queue=9, can_interrupt=False)
