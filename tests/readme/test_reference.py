@@ -8,6 +8,7 @@ import shlex
 import click
 import pytest
 
+from talkcli import __version__
 from talkcli.cli.click_app import talk
 from talkcli.cli.commands import COMMANDS
 from tests.readme import reference
@@ -94,3 +95,8 @@ def test_the_test_files_named_in_contributing_exist() -> None:
     """pytest stops if a file in such a command is missing."""
     for pattern in re.findall(r"\btests/[\w/*.]+", CONTRIBUTING.section("Set up, and test")):
         assert any(ROOT.glob(pattern)), pattern
+
+
+def test_the_changelog_has_a_section_for_this_version() -> None:
+    released = re.findall(r"^## (\S+) - \d{4}-\d\d-\d\d$", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE)
+    assert released[0] == __version__
