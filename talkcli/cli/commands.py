@@ -220,7 +220,7 @@ def _serve_fault(values: Mapping[str, Any], _: frozenset[str]) -> str | None:
         return f"the player {player} has no devices; leave out --device"
     history = values["history"]
     if history and "/" not in history and history not in {TEXT_HISTORY, NO_TEXT_HISTORY}:
-        return f"--history takes no-text or a path with a '/', such as ./{history}.db (got '{history}')"
+        return f"--history takes no-text or a path with a '/', such as ./history.db (got '{history}')"
     if player == "file:":
         return "--player file: needs a path, as in file:PATH.wav"
     return None
