@@ -14,6 +14,7 @@ import bisect
 import os
 import re
 import stat
+from collections import defaultdict
 
 from talkcli.errors import UsageError
 from talkcli.frozen import TYPE_CHECKING
@@ -38,11 +39,9 @@ _UNSPEAKABLE = re.compile("[\0-\b\x0e-\x1f\x7f-\x9f\ud800-\udfff]")
 #: A letter, a digit or an accent in a script that separates words with blanks. Other scripts begin at U+2E80.
 _LETTER = r"(?:[^\W\u2e80-\U0010ffff]|[\u0300-\u036f])"
 #: A place where a word may begin or end. Numbers such as "2.5" count as one word.
-_BORDER = rf"(?:(?<!{_LETTER})|(?!{_LETTER}))(?!(?<=\d)[.,:]\d)(?<!\d[.,:](?=\d))"
-#: A word, or any other visible character, with which a term may begin.
-_FIRST_WORD = re.compile(rf"{_LETTER}+|\S")
-#: A blank between two words of a term, which is not the end of a paragraph.
-_GAP = r"(?:(?!\n\s*\n)\s)+"
+_BORDER = re.compile(rf"(?:(?<!{_LETTER})|(?!{_LETTER}))(?!(?<=\d)[.,:]\d)(?<!\d[.,:](?=\d))")
+#: A piece of a term: a word, or any other visible character.
+_PIECE = re.compile(rf"{_LETTER}+|\S")
 #: In a text with phonemes, the sender's brackets become parentheses, which sound the same.
 _WITHOUT_BRACKETS = str.maketrans("[]", "()")
 
@@ -106,29 +105,42 @@ class Pronunciations:
 
     def __init__(self, terms: dict[str, str]) -> None:
         self.terms = terms
-        ordered = sorted(terms, key=lambda each: (-len(each), each == each.lower()))
-        #: the terms in the order in which they are tried, with their first words in lower case
-        self._first_words = {each: _FIRST_WORD.findall(each)[0].lower() for each in ordered}
+        #: for each first piece of a term, in lower case: the numbers of pieces that such terms have
+        self._lengths = defaultdict[str, set[int]](set)
+        for term in terms:
+            pieces = _PIECE.findall(term)
+            self._lengths[pieces[0].lower()].add(len(pieces))
 
     def apply(self, text: str, start: int = 0, end: int | None = None) -> SpokenText:
         """Return a text, or its part from `start` to `end`, with all terms replaced."""
         end = len(text) if end is None else end
         replacements, added = [], 0
-        for found, term in self._find(text, start):
-            if found.start() >= end or added > MAX_TEXT_CHARS:  # after that, terms are spoken as they are
+        for term_start, term_end, replacement in self._find(text, start):
+            if term_start >= end or added > MAX_TEXT_CHARS:  # after that, terms are spoken as they are
                 break
-            added += len(self.terms[term])
-            replacements.append((*found.span(), self.terms[term]))
+            added += len(replacement)
+            replacements.append((term_start, term_end, replacement))
         return SpokenText(text, start, end, replacements)
 
-    def _find(self, text: str, start: int) -> Iterator[tuple[re.Match[str], str]]:
-        """Yield each match of a term after an offset, with the term."""
+    def _find(self, text: str, start: int) -> Iterator[tuple[int, int, str]]:
+        """Yield the start, the end and the replacement of each term after an offset."""
         # A regular expression for all terms would take seconds for a long text.
-        words = {each.lower() for each in _FIRST_WORD.findall(text, start)} if self.terms else set()
-        terms = [term for term, first_word in self._first_words.items() if first_word in words]
-        pattern = re.compile(f"{_BORDER}(?:{'|'.join(map(_group_for, terms))}){_BORDER}")
-        for found in pattern.finditer(text, start) if terms else ():
-            yield found, terms[(found.lastindex or 0) - 1]
+        pieces, joined, end = list(_PIECE.finditer(text, start)) if self.terms else [], list[str](), start
+        for piece in pieces:
+            # A term has single blanks. In a text, it may have any blanks, except for the end of a paragraph.
+            gap, end = text[end : piece.start()], piece.end()
+            joined.append((gap and (" " if gap.count("\n") < 2 else gap)) + piece[0])
+        end = start
+        for index, first in enumerate(pieces):
+            begin, lengths = first.start(), self._lengths.get(first[0].lower(), ())
+            for length in sorted(lengths, reverse=True) if begin >= end and _BORDER.match(text, begin) else ():
+                found = "".join(joined[index : index + length]).lstrip()
+                last = pieces[index : index + length][-1].end()
+                replacement = self.terms.get(found) or self.terms.get(found.lower())
+                if replacement and _BORDER.match(text, last):
+                    yield begin, last, replacement
+                    end = last
+                    break
 
     def say(self, text: str, text_format: str) -> str | None:
         """Return a goal's text as it is said, for people to read. Return None if it is said as it was sent."""
@@ -139,12 +151,6 @@ class Pronunciations:
         else:
             said = self.apply(text).text
         return None if said == text else said
-
-
-def _group_for(term: str) -> str:
-    """Return a group of a regular expression that matches a term."""
-    words = _GAP.join(map(re.escape, term.split()))
-    return f"((?i:{words}))" if term == term.lower() else f"({words})"
 
 
 def parse_pronunciations(data: bytes) -> tuple[dict[str, str], list[str]]:

@@ -89,6 +89,13 @@ def test_replacements_lengthen_a_text_by_a_limited_number_of_characters() -> Non
     assert spoken.text.endswith("a a a ")
 
 
+@pytest.mark.parametrize("text", ["a " * 5_000, "a" + " " * 9_999, "a b " * 2_500])
+def test_many_similar_terms_are_found_quickly_in_a_long_text(text: str) -> None:
+    began = time.monotonic()
+    assert Pronunciations({f"a {number}": "x" for number in range(1_500)}).apply(text).text == text
+    assert time.monotonic() - began < 2
+
+
 FILE = """\ufeff# names of the site
 
 charger = a-[[tS'A@dZ3]]-b
