@@ -48,6 +48,6 @@ def test_the_directory_of_sounds_may_have_any_name(make_talk: MakeTalk, tmp_path
 def test_a_missing_directory_of_sounds_is_a_usage_error(tmp_path: Path) -> None:
     done = run([*TALK, "serve", "--sounds", "nowhere"], environment(str(tmp_path)))
     assert (done.code, done.out) == (2, "")
-    assert done.err == f"talk: --sounds: {os.getcwd()}/nowhere is not a directory\n"
+    assert done.err == f"talk: --sounds: {os.getcwd()}/nowhere is not a readable directory\n"
     done = run([*TALK, "serve", "--sounds", "nowhere", "--print-unit", "user"], environment(str(tmp_path)))
     assert f"--sounds={os.getcwd()}/nowhere" in done.out

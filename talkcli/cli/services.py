@@ -49,11 +49,8 @@ _HOME_DIRECTORIES = ("/home/", "/root/", "/run/user/")
 #: Directories to which the system-wide server can write.
 _WRITABLE_DIRECTORIES = ("/run/talk/", "/var/cache/talk/")
 #: What to do if the system-wide service can't use the path in an option, and in any other option.
-_HIDDEN_PATH_ADVICE = {
-    "--socket": "choose a path in /run/talk",
-    "--history": "leave out the path, so that the history is in /var/lib/talk",
-    "--player file:": "choose a file in /run/talk",
-}
+_HIDDEN_PATH_ADVICE = dict.fromkeys(("--socket", "--player file:"), "choose a path in /run/talk")
+_HIDDEN_PATH_ADVICE["--history"] = "leave out the path, so that the history is in /var/lib/talk"
 _LET_READ = "copy it into /etc/talk, and let everybody read it"
 
 
@@ -65,9 +62,7 @@ def serve(options: CommonOptions, print_unit: str | None, **given: Any) -> int:
     history = given["history"] or ""
     if "/" in history:
         given["history"] = os.path.abspath(history)
-    for name in ("sounds", "pronounce"):
-        if given[name]:
-            given[name] = os.path.abspath(given[name])
+    given |= {each: os.path.abspath(given[each]) for each in ("sounds", "pronounce") if given[each]}
     if print_unit:
         mode, words = given["socket_mode"], []
         if print_unit.startswith("system") and "socket_mode" not in options.typed:
@@ -75,8 +70,8 @@ def serve(options: CommonOptions, print_unit: str | None, **given: Any) -> int:
             words.append("--socket-mode=0660")
         state = _STATE_DIRECTORY if history and "/" not in history else ""
         return _print_unit(options, "serve", print_unit, given, words, mode=f"{mode:04o}", state=state)
-    if given["sounds"] and not os.path.isdir(given["sounds"]):
-        raise UsageError(f"--sounds: {printable(given['sounds'])} is not a directory")
+    if given["sounds"] and not os.access(os.path.join(given["sounds"], ""), os.R_OK | os.X_OK):
+        raise UsageError(f"--sounds: {printable(given['sounds'])} is not a readable directory")
     if not options.quiet:
         _warn_about_sound(given["player"] or "", given["driver"])
     from talkcli.goals.options import SETTINGS, Set

@@ -56,11 +56,7 @@ _OTHER_FILES = {
 
 
 class SoundError(Exception):
-    """Raised if a sound doesn't exist or can't be played. The message says what to do."""
-
-    def __init__(self, reason: Reason, message: str) -> None:
-        super().__init__(message)
-        self.reason = reason
+    """Raised with a reason and a message if a sound doesn't exist or can't be played. The message says what to do."""
 
 
 @frozen
@@ -82,20 +78,20 @@ class SoundLibrary:
 
     def __init__(self, directory: str | None) -> None:
         """Create a library of the built-in sounds and, optionally, the files in a directory."""
-        self._directory = directory
+        self._directory = directory or ""
 
     def names(self) -> list[str]:
         """Return the sorted names of all sounds. Read the directory each time."""
         files = self._files().items()
-        found = {name for name, file in files if file.lower().endswith(".wav") and name.isprintable()}
-        return sorted(found | BUILT_IN.keys())
+        return sorted(BUILT_IN.keys() | {name for name, file in files if _is_wav(file) and name.isprintable()})
 
     def refusal(self, name: str) -> Refusal | None:
         """Return the reason why a sound can't be played. Return None if it can."""
         try:
             file = self.open(name)
         except SoundError as error:
-            return error.reason, str(error)
+            reason, message = error.args
+            return reason, message
         if file:
             os.close(file.descriptor)
         return None
@@ -107,11 +103,11 @@ class SoundLibrary:
             SoundError: the sound is unknown, or its file can't be played.
         """
         file_name = self._files().get(name)
-        if file_name is not None:
-            return self._open_file(file_name)
-        if name not in BUILT_IN:
+        if name in BUILT_IN and not (file_name and _is_wav(file_name)):
+            return None
+        if file_name is None:
             raise SoundError(Reason.UNKNOWN_SOUND, self._unknown_message(name))
-        return None
+        return self._open_file(file_name)
 
     def _files(self) -> dict[str, str]:
         """Return the files in the directory by the names of their sounds. There are none if it can't be read.
@@ -122,12 +118,11 @@ class SoundLibrary:
             found = os.listdir(self._directory) if self._directory else []
         except OSError:
             found = []
-        return {os.path.splitext(each)[0]: each for each in sorted(found, key=lambda each: each.endswith(".wav"))}
+        return {os.path.splitext(each)[0]: each for each in sorted(found, key=lambda each: (_is_wav(each), each))}
 
     def _open_file(self, file_name: str) -> SoundFile:
         """Open a file in the directory. Raise SoundError if it can't be played."""
-        directory = self._directory or ""
-        path = os.path.join(directory, file_name)
+        directory, path = self._directory, os.path.join(self._directory, file_name)
         try:
             target = os.path.realpath(path)
             if not target.startswith(os.path.join(os.path.realpath(directory), "")):
@@ -154,6 +149,11 @@ class SoundLibrary:
             return f"{shown} is not the name of a sound; put the file into {where}, and run: {command}"
         more = f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else ""
         return f"unknown sound {shown}; the sounds are {', '.join(names[:_SHOWN_NAMES])}{more}"
+
+
+def _is_wav(file_name: str) -> bool:
+    """Return whether a file has the extension of a WAV file."""
+    return file_name.lower().endswith(".wav")
 
 
 def _refuse(path: str, words: str) -> NoReturn:
@@ -185,8 +185,7 @@ def _read_header(descriptor: int, path: str) -> SoundFile:
             form = _read_format(os.pread(descriptor, min(length, 40), position).ljust(40, b"\0"), path)
         elif name == b"data" and form:
             rate, channels, sample_bytes, is_float = form
-            if length == _UNKNOWN_BYTES:
-                length = size - position
+            length = size - position if length == _UNKNOWN_BYTES else length
             if position + length > size:
                 words = f"has {size - position:,} bytes of sound, but its header says {length:,}"
                 _refuse(path, f"is incomplete: it {words}; copy it again")

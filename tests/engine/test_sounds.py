@@ -178,8 +178,14 @@ def test_the_built_in_sounds_are_short_and_different(tmp_path: Path) -> None:
     assert len({*lengths}) == len(lengths)
 
 
-def test_a_file_of_the_same_name_replaces_a_built_in_sound(tmp_path: Path) -> None:
+def test_a_wav_file_of_the_same_name_replaces_a_built_in_sound(tmp_path: Path) -> None:
     write_tone(tmp_path / "chirp.wav", 0.02, RATE)
+    for name in ("chirp.mp3", "error.log", "warning", "horn.mp3", "horn.txt"):
+        (tmp_path / name).touch()
+    write_tone(tmp_path / "horn.WAV", 0.02, RATE)
+    library = SoundLibrary(str(tmp_path))
+    assert library.names() == ["chirp", "error", "horn", "warning"]
+    assert [library.refusal(each) for each in library.names()] == [None] * 4
     with Engine(sounds=str(tmp_path)) as engine:
         assert completed(started(engine), "chirp") == pytest.approx(0.02, abs=0.001)
 

@@ -51,7 +51,7 @@ def play_sound(library: SoundLibrary, command: Speak, playback: Playback, requir
     try:
         file = library.open(command.text)
     except SoundError as error:
-        raise CannotSpeak(error.reason, str(error)) from error
+        raise CannotSpeak(*error.args) from error
     try:
         rate, pieces = (file.rate, _read_samples(file)) if file else (DEFAULT_RATE_HZ, _make_tones(command.text))
         # At a lower rate than that of speech, a program's pipe would hold too much sound for an exact pause.
@@ -85,8 +85,7 @@ def _read_samples(file: SoundFile) -> Iterator[array[int]]:
             data = os.pread(file.descriptor, min(piece_bytes, end - position), position)
         except OSError as error:
             raise CannotSpeak(Reason.BAD_SOUND, f"{file.path} can't be read: {error.strerror}") from error
-        data = data[: len(data) // frame_bytes * frame_bytes]
-        if not data:
+        if not data or len(data) % frame_bytes:
             raise CannotSpeak(Reason.BAD_SOUND, f"{file.path} became shorter while it was played")
         position += len(data)
         samples = _decode(data, file)
