@@ -103,6 +103,7 @@ def test_a_file_of_speech_is_pronounced_alike(names: Path, tmp_path: Path) -> No
     dry = alone("say", "-q", "-o", f"{tmp_path}/y.wav", "--dry-run", *pronounce, TEXT)
     assert (dry.code, dry.out, (tmp_path / "y.wav").exists()) == (0, f"{SAID}\n", False)
     assert alone("say", "-o", f"{tmp_path}/y.wav", "--dry-run", "--voice", "parrot", TEXT).code == 5
+    assert json.loads(alone("--json", "say", "-o", "/dev/null", "hi").out)["output"] == "/dev/null"
     assert "talk serve --pronounce FILE" in alone("say", *pronounce, TEXT).err
 
 

@@ -124,14 +124,13 @@ def _input_fault(values: Mapping[str, Any], typed: frozenset[str]) -> str | None
 def _play_options() -> Iterator[Option]:
     """Yield the options of `play`: the options of `say` that make sense for a sound."""
     for each in _SAY_OPTIONS:
-        if not each.speech_only and each.name not in _TEXT_OPTIONS:
+        if each.name not in goal_options.SPEECH_OPTIONS | _TEXT_OPTIONS:
             words = each.help.partition("  [env var with")[0].replace("it was spoken", "it was played")
-            words = words.replace("the sentence", "the sound").replace("his sentence", "his sound")
-            yield each if words == each.help else replace(each, help=words)
+            yield replace(each, help=words.replace("the sentence", "the sound").replace("his sentence", "his sound"))
     yield option("--list", FLAG, "Print the names of all sounds.")
 
 
-#: Options of `say` for texts and words, in addition to those that are `speech_only`.
+#: Options of `say` for texts and words, in addition to `SPEECH_OPTIONS`.
 _TEXT_OPTIONS = {"feedback", "format", "lines", "ahead", "stream", "output", "pronounce"}
 _PLAY_OPTIONS = tuple(_play_options())
 
@@ -324,8 +323,7 @@ _ROWS = (
         description="""
         Play the sound NAME: chirp, warning, error, or a WAV file in the directory 'talk serve --sounds DIR'.
 
-        A sound is a goal like a sentence: it waits in the queue or interrupts, and it can be cancelled, paused and
-        awaited.
+        A sound is a goal like a sentence. It waits in the queue or interrupts, and can be cancelled and paused.
         """,
         function="say:play",
         fleet_function="several:play",

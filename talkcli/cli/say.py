@@ -10,15 +10,7 @@ import os
 
 from talkcli.cli.command import read_value, replace_bad_bytes
 from talkcli.cli.interrupts import Interrupts, discard_unread_output
-from talkcli.cli.show import (
-    note,
-    retry_without_output,
-    show_error,
-    show_if_possible,
-    show_json,
-    show_result,
-    standard_output,
-)
+from talkcli.cli.show import note, retry_without_output, show_error, show_if_possible, show_result, standard_output
 from talkcli.cli.wait import GoalReporter, seconds_left, timeout_error
 from talkcli.errors import EXIT_OK, Lost, UsageError
 from talkcli.frozen import TYPE_CHECKING
@@ -29,7 +21,7 @@ from talkcli.polling import Interrupted
 from talkcli.terminal.text import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
     from typing import Any
 
     from talkcli.cli.show import CommonOptions
@@ -121,9 +113,8 @@ def play(options: CommonOptions, sound: str, list: bool, **given: Any) -> int:  
             names = client.sounds()
         show_result(options, [{"name": each} for each in names], lambda: map(printable, names))
         return EXIT_OK
-    given |= {"feedback": False, "lines": False, "ahead": None, "stream": False, "stall": STALL_S, "output": None}
-    given |= {"pronounce": None, "dry_run": False}
-    return say(options, (sound,), format=SOUND, **given)
+    given |= dict.fromkeys(("feedback", "lines", "stream", "dry_run"), False) | {"stall": STALL_S, "ahead": None}
+    return say(options, (sound,), format=SOUND, output=None, pronounce=None, **given)
 
 
 def _read_input(
@@ -177,10 +168,10 @@ def _run_without_goal(
     else:
         from talkcli.engine.pronunciation import PronunciationFile, Pronunciations
 
-        report: Callable[[str], None] = (lambda _: None) if options.quiet else note
-        table = PronunciationFile(pronounce, report).refresh() if pronounce else Pronunciations({})
+        file = PronunciationFile(pronounce, lambda words: None if options.quiet else note(words)) if pronounce else None
+        table = file.refresh() if file else Pronunciations({})
         values["pronunciations"] = table.terms
-        code = _write_wav_file(os.devnull if dry_run else path, text, values, timeout, options)
+        code = _write_wav_file(None if dry_run else path, text, values, timeout, options)
         if code or not dry_run:
             return code
         goal = Goal("", State.PENDING, text, format=values["format"], said=table.say(text, values["format"]))
@@ -190,25 +181,30 @@ def _run_without_goal(
 
 
 def _write_wav_file(
-    path: str, text: str, values: Mapping[str, Any], timeout: float | None, options: CommonOptions
+    path: str | None, text: str, values: Mapping[str, Any], timeout: float | None, options: CommonOptions
 ) -> int:
-    """Write a text's speech to a WAV file, or to standard output for "-". Return the exit code."""
+    """Write a text's speech to a WAV file, or to standard output for "-". Return the exit code.
+
+    If there is no path, render the text, but write nothing.
+    """
     from talkcli.engine.parent.render import STANDARD_OUTPUT, render
 
     settings, seconds_at_most = _sound_settings(values), seconds_left(options.deadline(timeout))
-    more = {"markdown": values["format"] == MARKDOWN, "pronunciations": values["pronunciations"]}
+    more = {"markdown": values["format"] == MARKDOWN, "pronunciations": values["pronunciations"], **settings}
     if path in STANDARD_OUTPUT:
         if options.json:
             raise UsageError("--json and -o - both write to standard output; leave out one of them")
         standard_output()
+    target = os.devnull if path is None else path
     with Interrupts() as interrupts:
         try:
-            seconds = render(text, path, timeout=seconds_at_most, interrupt=interrupts.watched, **more, **settings)
+            seconds = render(text, target, timeout=seconds_at_most, interrupt=interrupts.watched, **more)
         except Interrupted:
             return interrupts.exit_code
-    if options.json and path != os.devnull:
+    if path is not None:
         result = {"output": path, "seconds": seconds, "text": text, **settings}
-        retry_without_output(show_if_possible, show_json, result)  # the file has been written, even if this fails
+        # The file has been written, even if this fails.
+        retry_without_output(show_if_possible, show_result, options, [result], tuple)
     return EXIT_OK
 
 

@@ -107,19 +107,17 @@ class Pronunciations:
         self.terms = terms
         #: for each first piece of a term, in lower case: the numbers of pieces that such terms have
         self._lengths = defaultdict[str, set[int]](set)
-        for term in terms:
-            pieces = _PIECE.findall(term)
+        for pieces in map(_PIECE.findall, terms):
             self._lengths[pieces[0].lower()].add(len(pieces))
 
     def apply(self, text: str, start: int = 0, end: int | None = None) -> SpokenText:
         """Return a text, or its part from `start` to `end`, with all terms replaced."""
-        end = len(text) if end is None else end
-        replacements, added = [], 0
-        for term_start, term_end, replacement in self._find(text, start):
-            if term_start >= end or added > MAX_TEXT_CHARS:  # after that, terms are spoken as they are
+        end, replacements, added = len(text) if end is None else end, [], 0
+        for first, last, replacement in self._find(text, start):
+            if first >= end or added > MAX_TEXT_CHARS:  # after that, terms are spoken as they are
                 break
             added += len(replacement)
-            replacements.append((term_start, term_end, replacement))
+            replacements.append((first, last, replacement))
         return SpokenText(text, start, end, replacements)
 
     def _find(self, text: str, start: int) -> Iterator[tuple[int, int, str]]:
@@ -132,13 +130,13 @@ class Pronunciations:
             joined.append((gap and (" " if gap.count("\n") < 2 else gap)) + piece[0])
         end = start
         for index, first in enumerate(pieces):
-            begin, lengths = first.start(), self._lengths.get(first[0].lower(), ())
-            for length in sorted(lengths, reverse=True) if begin >= end and _BORDER.match(text, begin) else ():
-                found = "".join(joined[index : index + length]).lstrip()
-                last = pieces[index : index + length][-1].end()
+            if first.start() < end or not _BORDER.match(text, first.start()):
+                continue
+            for length in sorted(self._lengths.get(first[0].lower(), ()), reverse=True):
+                found, last = "".join(joined[index : index + length]).lstrip(), pieces[index : index + length][-1].end()
                 replacement = self.terms.get(found) or self.terms.get(found.lower())
                 if replacement and _BORDER.match(text, last):
-                    yield begin, last, replacement
+                    yield first.start(), last, replacement
                     end = last
                     break
 

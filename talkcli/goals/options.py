@@ -262,8 +262,6 @@ class Option:
     for_engine: bool = False
     #: whether a goal's JSON includes the value
     in_goal: bool = False
-    #: whether a sound can't have this option
-    speech_only: bool = False
 
     @property
     def flags(self) -> str:
@@ -488,7 +486,6 @@ OPTIONS = (
         env="TALK_RATE",
         setting=Setting(200, words="rate {}"),
         for_engine=True,
-        speech_only=True,
     ),
     Option(
         "volume",
@@ -516,7 +513,6 @@ OPTIONS = (
             none_words="default voice",
         ),
         for_engine=True,
-        speech_only=True,
     ),
     Option(
         "voice_only",
@@ -526,7 +522,6 @@ OPTIONS = (
         default=False,
         help="Fail instead of speaking with another voice. Wait until the voice is loaded.",
         for_engine=True,
-        speech_only=True,
     ),
     Option(
         "pitch",
@@ -536,7 +531,6 @@ OPTIONS = (
         help="Set the pitch; 50 is normal. Neural voices don't support this option.",
         setting=Setting(50, words="pitch {}"),
         for_engine=True,
-        speech_only=True,
     ),
     Option(
         "lead_in",
@@ -566,7 +560,6 @@ OPTIONS = (
         FLAG,
         "whether text will be added with `append` while the goal waits or is spoken. `text` is then the beginning",
         default=False,
-        speech_only=True,
     ),
     Option(
         "stall",
@@ -577,7 +570,6 @@ OPTIONS = (
         limits=(MIN_STALL_S, MAX_STALL_S),
         unit=" seconds",
         help="With --stream, stop if no text arrives for TIME. The time starts when all of the text was spoken.",
-        speech_only=True,
     ),
     Option(
         "format",
@@ -599,7 +591,6 @@ OPTIONS = (
         "only check the goal. It is never spoken, and its id is empty. `said` shows how it would be said",
         default=False,
         help="Print TEXT as it would be said, and don't speak it.",
-        speech_only=True,
     ),
 )
 
@@ -607,6 +598,8 @@ OPTIONS = (
 ENGINE_OPTIONS = tuple(each.name for each in OPTIONS if each.for_engine)
 #: Options that affect how speech sounds, even if it is written to a file. Each one has a default on the server.
 SOUND_OPTIONS = tuple(each for each in OPTIONS if each.for_engine and each.setting)
+#: Names of the options that a sound can't have.
+SPEECH_OPTIONS = {"rate", "voice", "voice_only", "pitch", "more", "stall", "dry_run"}
 #: Names of the options that a goal's JSON includes.
 SHOWN_OPTIONS = tuple(each.name for each in OPTIONS if each.in_goal)
 #: Options that have a default on the server. Those sent to the engine come first.
@@ -858,7 +851,7 @@ def bad_option(request: Say | Set | Pause | Log) -> str | None:
     for option in request.options:
         value = getattr(request, option.name)
         if value != option.default:
-            if is_sound and option.speech_only:
+            if is_sound and option.name in SPEECH_OPTIONS:
                 return f"a sound can't have the option {option.name}; leave it out"
             if words := option.value_error(value):
                 return words

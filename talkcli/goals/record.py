@@ -122,11 +122,8 @@ class Record:
 
     def was_sent_as(self, say: Say) -> bool:
         """Return whether the goal was sent with the text or the sound of this request."""
-        if say.is_sound is not self.say.is_sound:
-            return False
-        if self.text_hash is not None:
-            return hash(say.text) == self.text_hash
-        return say.text == self.say.text[: self.first_chars]
+        text_hash = self.text_hash or hash(self.say.text[: self.first_chars])
+        return (say.is_sound, hash(say.text)) == (self.say.is_sound, text_hash)
 
     def snapshot(self, state: State | None = None) -> Goal:
         """Return an immutable copy of the goal, in its current state or in the given one.

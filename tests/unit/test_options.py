@@ -38,6 +38,7 @@ from talkcli.goals.options import (
     SETTINGS,
     SHOWN_OPTIONS,
     SOUND_OPTIONS,
+    SPEECH_OPTIONS,
     Append,
     Option,
     Say,
@@ -123,7 +124,7 @@ def test_a_sound_has_no_options_of_speech() -> None:
     for name, value in values.items():
         message = f"a sound can't have the option {name}; leave it out"
         assert bad_option(Say("chirp", format="sound", **{name: value})) == message  # type: ignore[arg-type]
-    assert {each.name for each in OPTIONS if each.speech_only} == values.keys()
+    assert values.keys() == SPEECH_OPTIONS
     others = {"volume": 0.5, "lead_in": 100, "audible": True, "key": "a", "throttle": 9, "ttl": 9, "feedback": True}
     assert bad_option(Say("chirp", format="sound", **others)) is None  # type: ignore[arg-type]
 

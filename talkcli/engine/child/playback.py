@@ -284,8 +284,6 @@ class Playback:
         self._begin = 0  # offset of the current player's first sample
         self._sent = 0  # offset after the last sample accepted by the player
         self._stopped = False
-        #: whether a sound is played instead of speech
-        self._is_sound = False
         #: whether `_skipped` is final
         self._start_known = False
         #: number of bytes of zero samples skipped at the beginning
@@ -334,7 +332,7 @@ class Playback:
 
     def begin_sound(self, rate: int) -> None:
         """Begin a sound instead of speech. It is played from its first sample, even if it is silent."""
-        self._samples.audible = self._start_known = self._is_sound = True
+        self._samples.audible = self._start_known = True
         self.begin(rate, "")
 
     def word(self, start: int, length: int, audio_start: float) -> None:
@@ -811,5 +809,5 @@ class Playback:
             end = self._samples.end
         self._samples.end_at(end, max(self._sent, end - faded))
         self._clock.drop_from(position)
-        rest = self._runner.text_start + max(self._sent, end - faded) // SAMPLE_BYTES if self._is_sound else None
+        rest = self._runner.text_start + max(self._sent, end - faded) // SAMPLE_BYTES if self._runner.sound else None
         raise EndedEarly(rest if word is None else word.start)

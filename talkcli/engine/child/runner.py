@@ -107,7 +107,6 @@ class ActiveGoal:
         self.growing_text = _make_growing_text(self.text, command) if command.more or command.broken else None
         self.text_missing = False
         #: how to say terms in the text
-        self.pronunciations = Pronunciations(command.pronunciations or {})
         #: number of characters received, and how many of them the server knows to be received
         self.length, self.reported_length = len(command.text), 0
         self.words = WordFinder(self.text, max(command.start, command.heard_end), command.heard_words)
@@ -346,7 +345,7 @@ class GoalRunner:
     @property
     def pronunciations(self) -> Pronunciations:
         """The pronunciations of terms in the text of the current goal."""
-        return self._goal.pronunciations if self._goal else Pronunciations({})
+        return Pronunciations(self._goal.command.pronunciations or {} if self._goal else {})
 
     @property
     def sound(self) -> protocol.Speak | None:
