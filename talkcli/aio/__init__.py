@@ -14,15 +14,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from talkcli.aio.client import Client, GoalHandle, SpeechStream
+
 if TYPE_CHECKING:
-    from talkcli.aio.client import Client, GoalHandle, SpeechStream
     from talkcli.fleet.aio import Fleet
 
 __all__ = ["Client", "Fleet", "GoalHandle", "SpeechStream"]
 
 
 def __getattr__(name: str) -> object:
-    if name not in __all__:
+    if name != "Fleet":  # only fleets need paho-mqtt
         raise AttributeError(f"module 'talkcli.aio' has no attribute {name!r}")
-    module = "fleet.aio" if name == "Fleet" else "aio.client"
-    return getattr(__import__(f"talkcli.{module}", fromlist=[name]), name)
+    from talkcli.fleet.aio import Fleet
+
+    return Fleet

@@ -12,14 +12,13 @@ starts no thread. If a task is cancelled while it waits, nothing is cancelled on
 
 from __future__ import annotations
 
-from contextlib import asynccontextmanager, closing
 from functools import partial
 from inspect import signature
 from typing import TYPE_CHECKING
 
 from talkcli.aio.connection import LoopSocketConnection
 from talkcli.client import client as blocking
-from talkcli.client.calls import ClientCalls, SayingCalls
+from talkcli.client.calls import ClientCalls, Paused, Saying
 from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.client.connection import event_reader
 from talkcli.client.goal import GoalCalls, end_time
@@ -30,6 +29,7 @@ from talkcli.protocol.events import Result, WordHeard
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+    from contextlib import AbstractAsyncContextManager
     from typing import Any
 
     from talkcli.aio.connection import LoopConnection
@@ -42,8 +42,7 @@ else:
         """Return a decorator that makes `help` show the parameters of `model` for a method."""
 
         def decorate(method: Callable) -> Callable:
-            shown = signature(method).return_annotation
-            method.__signature__ = signature(model).replace(return_annotation=shown)
+            method.__signature__ = signature(model).replace(return_annotation=signature(method).return_annotation)
             return method
 
         return decorate
@@ -67,8 +66,7 @@ class GoalHandle(GoalCalls):
 
     def feedback(self, timeout: float | None = None) -> AsyncIterator[WordHeard]:
         """Iterate over the goal's words as they are heard, until the goal has ended."""
-        events = self._iterate_events(timeout, feedback=True)
-        return (event async for event in events if isinstance(event, WordHeard))
+        return (each async for each in self._iterate_events(timeout, feedback=True) if isinstance(each, WordHeard))
 
     async def cancel(self) -> Goal:
         """Cancel the goal, and wait until it has stopped. Return it."""
@@ -110,16 +108,6 @@ class SpeechStream(StreamCalls):
 
     async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
         await self._finish(failed=kind is not None)
-
-
-class Saying(SayingCalls):
-    """A text that is spoken until an `async with` block ends. `Client.saying` creates it."""
-
-    async def __aenter__(self) -> GoalHandle:
-        return await self._begin(GoalHandle)
-
-    async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        await self._end(failed=kind is not None)
 
 
 class Client(ClientCalls):
@@ -169,24 +157,24 @@ class Client(ClientCalls):
         return await self._say(GoalHandle, *text, format=SOUND, **options)
 
     @with_parameters_of(blocking.Client.say)
-    def saying(self, *text: str, **options: Any) -> Saying:
+    def saying(self, *text: str, **options: Any) -> AbstractAsyncContextManager[GoalHandle]:
         """Return an asynchronous context manager that speaks a text until its block ends.
 
         It cancels the goal even if the task is cancelled.
         """
-        return Saying(self, *text, **options)
+        return Saying(self, GoalHandle, *text, **options)
 
     @with_parameters_of(blocking.Client.stream)
     def stream(self, **options: Any) -> SpeechStream:
         """Return a stream that speaks a text while the text is being written."""
         return SpeechStream(self._connection, self._stream_request(**options))
 
-    @asynccontextmanager
-    async def paused(self, seconds: float = PAUSE_S) -> AsyncIterator[Goal | None]:
-        """Pause all speech until the block ends. The value of the context manager is the paused goal, if any."""
-        connection, goal = await self._pause_while_connected(seconds)
-        with closing(connection):
-            yield goal
+    def paused(self, seconds: float = PAUSE_S) -> AbstractAsyncContextManager[Goal | None]:
+        """Return an asynchronous context manager that pauses all speech until its block ends.
+
+        Its value is the paused goal, if any.
+        """
+        return Paused(self, seconds)
 
     async def follow(self, ids: Iterable[str] | None = None, *, feedback: bool = False) -> list[GoalHandle]:
         """Subscribe to the events of goals. Return the goals' handles."""

@@ -61,13 +61,11 @@ class Watch:
 
 
 async def wait_ready(
-    watched: Mapping[int, int],
-    timeout: float | None,
-    interrupt: Mapping[int, int] | None = None,  # noqa: ARG001 - tasks are cancelled instead
+    watched: Mapping[int, int], timeout: float | None, _interrupt: Mapping[int, int] | None = None
 ) -> set[int]:
     """Suspend until a descriptor is ready or the time is up. Return the descriptors that are ready.
 
-    The arguments are those of `polling.wait_ready`.
+    The arguments are those of `polling.wait_ready`. Nothing interrupts the wait, because tasks are cancelled instead.
     """
     ended = asyncio.Event()
     watch = Watch(watched, NEVER if timeout is None else max(0.0, timeout), ended.set)

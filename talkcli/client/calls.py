@@ -123,12 +123,10 @@ class ClientCalls(ConnectedClient):
     ) -> list[Goal]:
         """Return the most recently ended goals, including REJECTED ones, oldest first."""
         request = Log(count, since, until, state.name if state else None, name, key, grep)
-        check(request)
         # Older servers have no history, and know no filters.
         known = "history" in (self._connection.server.features or ())
         request = replace(request, history=history and (known or request != Log(count)))
-        _, items = await self._connection.request(request)
-        return list(goals(items, "goal"))
+        return list(goals((await self._ask(request))[1], "goal"))
 
     async def dry_run(self, text: str, **options: Any) -> Goal:
         """Check a text without speaking it. Return its goal as it would be accepted or REJECTED."""
@@ -163,34 +161,24 @@ class ClientCalls(ConnectedClient):
         ttl: float | None = None,
     ) -> JsonObject:
         """Change the server's settings. Return all settings."""
-        request = Set(rate, volume, voice, pitch, preempt, ttl)
-        check(request)
-        reply, _ = await self._connection.request(request)
+        reply, _ = await self._ask(Set(rate, volume, voice, pitch, preempt, ttl))
         settings = reply.get("settings")
         return settings if isinstance(settings, dict) else {}
 
     async def pause(self, seconds: float | None = None) -> Goal | None:
         """Pause all speech, and wait until it has stopped. Return the paused goal, if any."""
-        request = Pause(seconds)
-        check(request)
-        return goal_in((await self._connection.request(request))[0])
+        return goal_in((await self._ask(Pause(seconds)))[0])
 
     async def resume(self) -> Goal | None:
         """Resume speech. Return the resumed goal, if any."""
         return goal_in((await self._connection.request(Resume()))[0])
 
-    # -- calls that clients adapt, because their results depend on the client
-
-    async def _pause_while_connected(self, seconds: float) -> tuple[Connection, Goal | None]:
-        """Pause all speech over a new connection. Return the connection and the paused goal, if any."""
-        request = Pause(seconds, while_connected=True)
+    async def _ask(self, request: Set | Pause | Log) -> tuple[JsonObject, list[JsonObject]]:
+        """Check the options of a request, and send it. Return the reply and the items of its list."""
         check(request)
-        connection = await self._connection.open_another()
-        try:
-            return connection, goal_in((await connection.request(request))[0])
-        except BaseException:
-            connection.close()
-            raise
+        return await self._connection.request(request)
+
+    # -- calls that clients adapt, because their results depend on the client
 
     async def _say(
         self, handle_type: type[_Handle], text: str, *, follow: bool = True, block: bool = True, **options: Any
@@ -285,36 +273,53 @@ class ClientCalls(ConnectedClient):
         return goal_id
 
 
-class SayingCalls:
-    """The base class of context managers that speak a text until their block ends."""
+class Saying:
+    """An asynchronous context manager that speaks a text until its block ends. Its value is the goal's handle."""
 
-    def __init__(self, client: ClientCalls, *text: str, **options: Any) -> None:
+    def __init__(self, client: ClientCalls, handle_type: type[GoalCalls], *text: str, **options: Any) -> None:
         """Prepare to speak a text, without sending anything.
 
-        The arguments are those of `Client.say`. The client chooses the id, so that the goal can be cancelled even if
-        the wait for the server's answer is interrupted.
+        The other arguments are those of `Client.say`. The client chooses the id, so that the goal can be cancelled even
+        if the wait for the server's answer is interrupted.
         """
-        self._client, self._text = client, text
+        self._client, self._handle_type, self._text = client, handle_type, text
         self._options = {**options, "id": options.get("id") or client._connection.new_goal_id()}
 
-    async def _begin(self, handle_type: type[_Handle]) -> _Handle:
-        """Send the goal. Return its handle."""
+    async def __aenter__(self) -> Any:
         try:
-            handle = await self._client._say(handle_type, *self._text, **self._options)
+            self._handle = await self._client._say(self._handle_type, *self._text, **self._options)
         except BaseException as error:
             if not isinstance(error, TalkError):
                 self._client._connection.begin(Cancel((self._options["id"],)), on_failure=lambda _: None)
             raise
-        self._cancel = handle._cancel
-        return handle
+        return self._handle
 
-    async def _end(self, *, failed: bool) -> None:
-        """Cancel the goal, unless it has ended. If the block has failed, ignore errors."""
+    async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
-            await self._cancel()
+            await self._handle._cancel()
         except TalkError:
-            if not failed:
+            if kind is None:  # otherwise, the block's own exception is raised
                 raise
+
+
+class Paused:
+    """An asynchronous context manager that pauses all speech until its block ends. Its value is the paused goal."""
+
+    def __init__(self, client: ClientCalls, seconds: float) -> None:
+        """Prepare the pause, without connecting. It ends after this number of seconds at the latest."""
+        self._client, self._request = client, Pause(seconds, while_connected=True)
+
+    async def __aenter__(self) -> Goal | None:
+        check(self._request)
+        self._connection = await self._client._connection.open_another()
+        try:
+            return goal_in((await self._connection.request(self._request))[0])
+        except BaseException:
+            self._connection.close()
+            raise
+
+    async def __aexit__(self, *_: object) -> None:
+        self._connection.close()
 
 
 def check_id(goal_id: str) -> None:

@@ -12,7 +12,7 @@ All errors except TimeoutError are subclasses of `talkcli.errors.TalkError`.
 
 from __future__ import annotations
 
-from talkcli.client.calls import ClientCalls, ConnectedClient, SayingCalls, with_parameters_of
+from talkcli.client.calls import ClientCalls, ConnectedClient, Paused, Saying, with_parameters_of
 from talkcli.client.connect import ANSWER_LIMIT_S
 from talkcli.client.connection import ReconnectingConnection
 from talkcli.client.goal import GoalHandle
@@ -167,7 +167,7 @@ class Client(ConnectedClient):
         return run_blocking(self._calls.dry_run(text, **options))
 
     @with_parameters_of(say)
-    def saying(self, text: str, **options: Any) -> Saying:
+    def saying(self, text: str, **options: Any) -> AbstractContextManager[GoalHandle]:
         """Return a context manager that speaks a text until its block ends.
 
             with talk.saying("please step back") as goal:
@@ -179,7 +179,7 @@ class Client(ConnectedClient):
         At the end of the block, the errors are those of `GoalHandle.cancel`. If an exception ends the block, it is
         raised instead.
         """
-        return Saying(self._calls, text, **options)
+        return _BlockingManager(Saying(self._calls, GoalHandle, text, **options))
 
     @with_parameters_of(say)
     def play(self, text: str, **options: Any) -> GoalHandle:
@@ -408,15 +408,7 @@ class Client(ConnectedClient):
         Raises:
             UsageError: `seconds` is out of its range, or this client uses a broker.
         """
-        from contextlib import closing, contextmanager  # rarely needed, and slow to import
-
-        @contextmanager
-        def pause_in_block() -> Iterator[Goal | None]:
-            connection, goal = run_blocking(self._calls._pause_while_connected(seconds))
-            with closing(connection):
-                yield goal
-
-        return pause_in_block()
+        return _BlockingManager(Paused(self._calls, seconds))
 
     def resume(self) -> Goal | None:
         """Resume speech. Return the resumed goal, if any.
@@ -444,11 +436,14 @@ class Client(ConnectedClient):
         return iter(lambda: run_blocking(next_event()), None)
 
 
-class Saying(SayingCalls):
-    """A text that is spoken until a `with` block ends. `Client.saying` creates it."""
+class _BlockingManager:
+    """A context manager that blocks instead of suspending, like `run_blocking`."""
 
-    def __enter__(self) -> GoalHandle:
-        return run_blocking(self._begin(GoalHandle))
+    def __init__(self, manager: Saying | Paused) -> None:
+        self._manager = manager
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        run_blocking(self._end(failed=kind is not None))
+    def __enter__(self) -> Any:
+        return run_blocking(self._manager.__aenter__())
+
+    def __exit__(self, *error: object) -> None:
+        run_blocking(self._manager.__aexit__(*error))  # type: ignore[arg-type]
