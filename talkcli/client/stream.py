@@ -61,7 +61,7 @@ class StreamCalls:
         """Send the rest of the text, or stop the goal if the program that writes the text has failed."""
         if failed and not self._stopped:
             await self._break_off()
-        elif self.goal and not failed:
+        elif self._goal_id and not failed:
             self._text.ended = True
             await self._send()
 
