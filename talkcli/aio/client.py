@@ -74,9 +74,12 @@ class GoalHandle(GoalCalls):
 
     async def _iterate_events(self, timeout: float | None, *, feedback: bool) -> AsyncIterator[Event]:
         """Yield the goal's events up to the Result. Raise TimeoutError if `timeout` expires first."""
-        read, event = event_reader(self._connection, self._take, end_time(timeout)), None
+        end, event = end_time(timeout), None
+        read = event_reader(self._connection, self._take, end)
         await self._follow(feedback=feedback)
         while not isinstance(event, Result):
+            # If the task is cancelled during this wait, no event has been taken.
+            await self._connection.until(self._has_event, end)
             event = await self._read_event(read, timeout)
             yield event
 

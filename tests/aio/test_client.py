@@ -241,6 +241,33 @@ async def test_a_cancelled_task_cancels_nothing_on_the_robot(scripted: Talk) -> 
 
 
 @in_loop
+async def test_no_event_is_lost_if_a_task_is_cancelled_when_it_arrives(scripted: Talk) -> None:
+    async with Client(scripted.socket) as talk:
+        await talk.pause()
+        goal = await talk.say("length=0")
+        assert goal.poll()
+        task: asyncio.Task[Event] = asyncio.create_task(goal.events().__anext__())  # type: ignore[arg-type]
+        await asyncio.sleep(0)
+        resuming = asyncio.create_task(talk.resume())
+        while not goal._has_event():  # noqa: ASYNC110 - the task must be cancelled before it runs again
+            await asyncio.sleep(0)
+        task.cancel()
+        await asyncio.gather(task, resuming, return_exceptions=True)
+        events = [event async for event in goal.events(PATIENCE)]
+        assert [type(event) for event in events] == [StateChanged, StateChanged, Result]
+
+
+@in_loop
+async def test_a_stream_is_completed_although_its_write_was_interrupted(scripted: Talk) -> None:
+    async with Client(scripted.socket) as talk:
+        async with talk.stream() as speech:
+            await interrupted(speech.write("length=0 "))
+            assert speech.goal is None
+        assert speech.goal
+        assert (await speech.goal.wait(PATIENCE)).state is State.SUCCEEDED
+
+
+@in_loop
 async def test_an_interrupted_saying_or_stream_ends_its_goal(scripted: Talk) -> None:
     async with Client(scripted.socket) as talk:
         await talk.pause()
