@@ -6,6 +6,8 @@ import contextlib
 import os
 import sqlite3
 import time
+from functools import partial
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -50,11 +52,24 @@ def test_only_the_owner_may_read_the_file_and_its_directory(path: str, writer: H
     assert modes == [0o700, 0o600, 0o600, 0o600]
 
 
-def test_goals_are_deleted_after_90_days(path: str, writer: HistoryWriter) -> None:
-    now, day = time.time(), 24 * 3600
-    writer.write([goal(1, ended_at=now - 90 * day - 60), goal(2, ended_at=now - 90 * day + 60)])
-    writer.write([])
-    assert stored(path) == ["4k7f-2"]
+def test_goals_are_deleted_after_90_days_by_a_clock_that_was_not_set(
+    path: str, writer: HistoryWriter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The robot boots in 1970, and later ten years in the future."""
+    day = 24 * 3600.0
+    for number, (now, uptime, kept) in enumerate(
+        (
+            (1.8e9, 0.0, [0]),
+            (100.0, 10.0, [0, 1]),
+            (1.8e9 + 3650 * day, 20.0, [0, 1, 2]),
+            (1.8e9 + 89 * day, 30.0, [0, 1, 2, 3]),
+            (1.8e9 + 89.5 * day, 30.0 + day / 2, [0, 1, 2, 3, 4]),
+            (1.8e9 + 91 * day, 30.0 + 2 * day, [3, 4, 5]),
+        )
+    ):
+        monkeypatch.setattr(file, "time", SimpleNamespace(time=partial(float, now), monotonic=partial(float, uptime)))
+        writer.write([goal(number, ended_at=now)])
+        assert stored(path) == [f"4k7f-{each}" for each in kept]
 
 
 def test_a_full_file_keeps_its_size_and_the_newest_goals(

@@ -6,6 +6,7 @@ All functions may wait for the disk. If the file can't be used, they raise Histo
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import sqlite3
 import stat
@@ -27,6 +28,10 @@ if TYPE_CHECKING:
 
 #: Goals that ended longer ago than this are deleted.
 MAX_AGE_S = 90 * 24 * 3600.0
+#: How long the clock must run without being set before goals are deleted by age. A robot may boot with a wrong time.
+STEADY_CLOCK_S = 600.0
+#: A clock that differs by more than this from the monotonic clock was set.
+_CLOCK_TOLERANCE_S = 60.0
 #: Maximum size of the goals and their indexes. Together with the write-ahead log (WAL), the file has at most 64 MB.
 MAX_CONTENT_BYTES = 56_000_000
 #: Maximum size of the WAL. It can't be emptied while another program reads the file.
@@ -41,6 +46,12 @@ PRAGMA wal_autocheckpoint = 256; PRAGMA journal_size_limit = 1048576;
 """
 #: Returns the size of the used pages. A page has 4,096 bytes, which is SQLite's default.
 _CONTENT_BYTES = "SELECT (page_count - freelist_count) * 4096 FROM pragma_page_count, pragma_freelist_count"
+#: Deletes the goals before the first one that ended in the given time span. Therefore, a goal with a wrong time is kept
+#: as long as the goals before it. `+` prevents a slower search with an index.
+_DELETE_TOO_OLD = """
+DELETE FROM goals WHERE number <
+    (SELECT number FROM goals WHERE +ended_at BETWEEN ? AND ? ORDER BY number LIMIT 1)
+"""
 #: Deletes the oldest 5 % of the goals.
 _DELETE_OLDEST = """
 DELETE FROM goals WHERE number <=
@@ -78,6 +89,8 @@ class HistoryWriter:
         self._connection: sqlite3.Connection | None = None
         #: the file that was opened last
         self._file: FileIdentity | None = None
+        #: the time minus the monotonic time, and the monotonic time since when this is the same
+        self._clock_offset, self._steady_since = math.inf, 0.0
 
     def write(self, goals: Sequence[Goal], damaged_file: FileIdentity | None = None) -> str | None:
         """Write goals in one transaction, and delete goals that are too old or don't fit.
@@ -124,15 +137,24 @@ class HistoryWriter:
         if is_large and connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()[0]:
             raise OSError("another program has been reading the file for too long")
         connection.execute("BEGIN IMMEDIATE")
-        connection.execute("DELETE FROM goals WHERE ended_at < ?", (time.time() - MAX_AGE_S,))
         rows = list(map(to_row, goals))
         added_bytes = 4 * sum(map(row_chars, rows))  # a character has at most four bytes
         while connection.execute(_CONTENT_BYTES).fetchone()[0] + added_bytes > MAX_CONTENT_BYTES:
             if connection.execute(_DELETE_OLDEST).rowcount == 0:
                 break
         connection.executemany(_INSERT, rows)
+        if self._is_clock_steady():
+            connection.execute(_DELETE_TOO_OLD, (time.time() - MAX_AGE_S, time.time()))
         connection.execute("COMMIT")
         return message
+
+    def _is_clock_steady(self) -> bool:
+        """Return whether the clock has run long enough without being set."""
+        now = time.monotonic()
+        offset = time.time() - now
+        if abs(offset - self._clock_offset) > _CLOCK_TOLERANCE_S:
+            self._clock_offset, self._steady_since = offset, now
+        return now - self._steady_since >= STEADY_CLOCK_S
 
     def _open(self) -> sqlite3.Connection:
         """Open the file, and create it if necessary. Return the connection."""
