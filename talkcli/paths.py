@@ -187,10 +187,12 @@ def history_file(option: str, socket: str) -> str:
 def history_files(named: str | None) -> list[str]:
     """Return the paths where the servers that a client tries may have their histories.
 
-    If `named` is given, it is the path of the only server's socket.
+    If `named` is given, it is the path of the only server's socket. Otherwise, only the last one is the socket of the
+    system-wide server.
     """
-    names = map(_history_name, client_sockets(named))
-    return [os.path.join(each, name) for name in names for each in (_state_directory(), _SYSTEM_STATE_DIRECTORY)]
+    names = [*map(_history_name, client_sockets(named))]
+    places = [os.path.join(_state_directory(), name) for name in names]
+    return [*places, os.path.join(_SYSTEM_STATE_DIRECTORY, names[-1])]
 
 
 def _history_name(socket: str) -> str:

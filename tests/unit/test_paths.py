@@ -1,4 +1,4 @@
-"""Paths: the socket of the user who called sudo."""
+"""Paths: the socket of the user who called sudo, and histories."""
 
 from __future__ import annotations
 
@@ -31,3 +31,10 @@ def test_the_socket_of_the_user_who_called_sudo_is_named_only_if_it_exists(
     assert paths.sudo_caller_socket() is None  # somebody else made it
     monkeypatch.delenv("SUDO_UID")
     assert paths.sudo_caller_socket() is None
+
+
+def test_only_the_system_wide_socket_has_its_history_in_the_systems_directory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", "/state")
+    monkeypatch.setattr(paths, "client_sockets", lambda _: ["/run/user/7/talk/talk.sock", paths.SYSTEM_SOCKET])
+    user, system = "run-user-7-talk-talk.sock.db", "run-talk-talk.sock.db"
+    assert paths.history_files(None) == [f"/state/talk/{user}", f"/state/talk/{system}", f"/var/lib/talk/{system}"]
