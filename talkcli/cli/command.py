@@ -267,7 +267,8 @@ def _parse_moment(text: str) -> float:
     day, _, clock = text.rpartition(" ") if ":" in text else (text or "?", "", "00:00")
     try:
         if text.endswith(("h", "m", "s")):
-            return (now - timedelta(seconds=_parse_duration(text, "s"))).timestamp()
+            # Without a time zone, the difference would be wrong if daylight saving time has begun or ended since then.
+            return (now.astimezone() - timedelta(seconds=_parse_duration(text, "s"))).timestamp()
         date = now - timedelta(_DAYS_AGO[day]) if day in _DAYS_AGO else datetime.strptime(day, "%Y-%m-%d")
         time = datetime.strptime(clock, "%H:%M:%S" if clock.count(":") > 1 else "%H:%M").time()
         return datetime.combine(date, time).timestamp()

@@ -54,7 +54,7 @@ from talkcli.protocol.requests import REQUEST_TYPES
 from talkcli.server import run
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
 ROWS = {option.name: option for option in OPTIONS}
 INVALID_SECONDS: list[object] = [-1, -0.001, math.nan, math.inf, -math.inf, 10**400, -(10**400)]
@@ -388,12 +388,23 @@ def test_a_point_in_time_is_local(text: str, days_ago: int, clock: str) -> None:
     assert read.date() + dt.timedelta(days_ago) in {before, dt.date.today()}
 
 
+@pytest.fixture
+def berlin() -> Iterator[None]:
+    """Use a time zone with daylight saving time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TZ", "Europe/Berlin")
+        time.tzset()
+        yield
+    time.tzset()
+
+
+@pytest.mark.usefixtures("berlin")
 def test_a_point_in_time_may_have_a_date_or_be_before_now() -> None:
     for text in ("2026-11-24 14:00", "2026-3-9 2:07:08", "2026-11-24"):
         day, _, clock = text.partition(" ")
         parts = [*map(int, (*day.split("-"), *filter(None, clock.split(":"))))]
         assert read_value(SINCE, text) == dt.datetime(*parts).timestamp()  # type: ignore[arg-type]
-    for text, seconds in {"2h": 7200, "90m": 5400, "500ms": 0.5}.items():
+    for text, seconds in {"2h": 7200, "90m": 5400, "500ms": 0.5, "4380h": 4380 * 3600}.items():  # half a year
         before = time.time() - seconds
         assert before - 0.001 <= read_value(SINCE, text) <= time.time() - seconds + 0.001
     for text in (
