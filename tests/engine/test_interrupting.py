@@ -56,13 +56,16 @@ def _continue_to_the_end(engine: Engine, ended: protocol.Ended, **fields: Any) -
     return ended
 
 
+def _tiny_voice(folder: Path) -> dict[str, str]:
+    """Install the neural voice "piper/tiny", and return the environment for its engine."""
+    needs_packages(*NEURAL_PACKAGES)
+    tiny_voice.put(folder / "voices", "tiny")
+    return {"TALK_VOICES": str(folder / "voices"), "XDG_CACHE_HOME": str(folder / "cache")}
+
+
 @pytest.mark.parametrize("voice", [None, "piper/tiny"])
 def test_the_parts_of_an_interrupted_sentence_have_its_words_and_its_length(tmp_path: Path, voice: str | None) -> None:
-    environment = {}
-    if voice:
-        needs_packages(*NEURAL_PACKAGES)
-        tiny_voice.put(tmp_path / "voices", "tiny")
-        environment = {"TALK_VOICES": str(tmp_path / "voices"), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    environment = _tiny_voice(tmp_path) if voice else {}
     given: dict[str, Any] = {"voice": voice, "voice_only": voice is not None}
     with Engine(environment=environment) as engine:
         engine.send(_speak(**given))
@@ -101,6 +104,15 @@ def test_a_sentence_is_interrupted_at_once_if_nothing_was_heard() -> None:
         engine.send(_speak(**rest), protocol.Interrupt("g1"))
         ended = engine.until(protocol.Ended)
         assert (ended.outcome, ended.rest, ended.heard) == (protocol.OUTCOME_INTERRUPTED, 4, 0.2)
+
+
+def test_an_early_interruption_is_no_failure_of_a_neural_voice(tmp_path: Path) -> None:
+    with Engine(environment=_tiny_voice(tmp_path)) as engine:
+        engine.send(_speak(voice="piper/tiny", voice_only=True))  # this loads the voice
+        engine.until(protocol.Ended)
+        engine.send(_speak(voice="piper/tiny"), protocol.Interrupt("g1"))
+        assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_INTERRUPTED
+        assert {each.voice for each in engine.events if isinstance(each, protocol.VoiceChosen)} == {"piper/tiny"}
 
 
 def test_a_sentence_ends_as_usual_if_no_word_follows() -> None:

@@ -39,7 +39,7 @@ class Stopped(Exception):
     """Raised by the playback if the sentence was stopped."""
 
 
-class EndedEarly(Exception):
+class EndedEarly(Stopped):
     """Raised if an `Interrupt` ends the sentence.
 
     Args:
