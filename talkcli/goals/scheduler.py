@@ -929,7 +929,7 @@ class Scheduler:
             return goal.stop_requested_at + CONFIRM_SILENCE_S
         if goal.stalls_at < inf and not self.paused:
             return goal.stalls_at
-        return inf if self.has_engine or goal.begun_end else goal.expires_at
+        return inf if self.has_engine or goal.was_heard else goal.expires_at
 
     def _next_attempt_time(self) -> float:
         """Return the monotonic time of the next attempt to start a goal."""
@@ -955,7 +955,8 @@ class Scheduler:
     def _interrupt_active(self) -> list[Effect]:
         """Interrupt the active goal if an interjection is waiting for that. Return the order, if any.
 
-        Another interjection is only interrupted by one with a higher priority.
+        Another interjection is only interrupted by one with a higher priority. A goal that preempts is not interrupted
+        by an older interjection, because it goes before that in the queue, too.
         """
         active = self.active
         if active is None or active.state is not State.ACTIVE or self.paused or self._interrupter is not None:
@@ -963,7 +964,7 @@ class Scheduler:
         if not self._can_interrupt or len(self.interrupted) >= MAX_INTERRUPTED:
             return []
         interjection = self._find_interjection(active.say.priority + active.say.interject)
-        if interjection is None:
+        if interjection is None or (active.preempt and interjection.number < active.number):
             return []
         self._interrupter = interjection.id
         return [EngineOrder(active, Order.INTERRUPT)]

@@ -107,6 +107,8 @@ waits for interrupted goals of a higher priority
     a 1; b 1 interject; interrupted a; c preempt; completed b -> a ACTIVE; c PENDING; b SUCCEEDED
 ends a goal that is being interrupted
     a; b interject; c preempt; stopped a -> c ACTIVE; b PENDING; a PREEMPTED preempted by c
+is interrupted by a newer interjection
+    a; b preempt; stopped a; c interject; interrupted b -> c ACTIVE; b ACTIVE paused for c; a PREEMPTED preempted by b
 in a pause ends interrupted goals
     a; b interject; pause; interrupted a; c preempt -> c b PENDING; a PREEMPTED preempted by c
 # an interrupted goal
@@ -164,6 +166,10 @@ def test_interrupted_goals_end_before_an_urgent_goal_starts() -> None:
         assert robot.seen.index("c PREEMPTED") < robot.seen.index("d Start")
 
 
+def test_a_goal_that_preempts_is_not_interrupted_by_an_older_interjection() -> None:
+    assert "c Interrupt" not in play("a; b interject; c preempt; stopped a; d").seen
+
+
 def test_at_most_eight_goals_are_interrupted_and_the_next_interjection_waits() -> None:
     robot = play("a")
     for priority, name in enumerate("bcdefghi", 1):
@@ -200,6 +206,13 @@ def test_a_goal_that_was_ever_muted_or_had_gaps_says_so_at_its_end() -> None:
         "Talk completed successfully, but the output was muted: usb, "
         "but with 3 gaps (0.8 s in total): this machine is too slow for the voice"
     )
+
+
+def test_the_rest_of_a_sound_does_not_expire_while_it_waits_for_an_engine() -> None:
+    robot = play("a format=sound ttl=1")
+    robot.scheduler.audio_heard(robot.goals["a"].id, 0.25)
+    robot.play("b interject; interrupted a; completed b; lost; wait 2")
+    assert robot.outcome() == "a ACTIVE; b SUCCEEDED"
 
 
 def test_a_goal_of_which_nothing_is_left_to_say_has_succeeded() -> None:
