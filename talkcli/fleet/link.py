@@ -60,6 +60,8 @@ MAX_RECEIVE_COUNT = 65_535
 _REASONS_DENIED = (0x86, 0x87, 0x8A, 0x8C)
 _REASON_UNSUPPORTED_PROTOCOL = 0x84
 REASON_FAILURE, REASON_NOT_AUTHORIZED = 0x80, 0x87
+#: Name of the MQTT user property that contains a robot's token.
+_TOKEN_PROPERTY = "talk-token"
 #: Values for SO_LINGER. A closed link usually discards unsent data, so that no sentence arrives minutes too late.
 _LINGER_DISCARD, _LINGER_DELIVER = struct.pack("ii", 1, 0), struct.pack("ii", 0, 0)
 
@@ -233,7 +235,7 @@ class Link:
             on_acknowledged: called with the reason code of the broker's acknowledgement of a QoS 1 message.
         """
         topic, payload = message.topic, message.payload
-        properties = _properties(message.expiry, message.response, message.correlation)
+        properties = _properties(message.expiry, message.response, message.correlation, message.token)
         with self._lock:
             if self.ended is not None:
                 return False
@@ -331,6 +333,7 @@ class Link:
         """Convert a message from paho, and pass it to `on_message`."""
         names = "ResponseTopic", "CorrelationData", "MessageExpiryInterval"
         properties = [getattr(message.properties, each, None) for each in names]
+        properties.append(dict(getattr(message.properties, "UserProperty", ())).get(_TOKEN_PROPERTY))
         self._deliver(Message(message.topic, bytes(message.payload), message.retain, *properties))
 
     def _on_publish(self, _client: paho.Client, _data: object, mid: int, code: ReasonCode, _: object) -> None:
@@ -348,7 +351,7 @@ class Link:
 
 
 @lru_cache(maxsize=32)
-def _properties(expiry: float | None, response: str | None, correlation: bytes | None) -> Properties:
+def _properties(expiry: float | None, response: str | None, correlation: bytes | None, token: str | None) -> Properties:
     """Return the MQTT properties for a message.
 
     They are cached, because creating them is slow.
@@ -360,6 +363,8 @@ def _properties(expiry: float | None, response: str | None, correlation: bytes |
         properties.ResponseTopic = response
     if correlation is not None:
         properties.CorrelationData = correlation
+    if token is not None:
+        properties.UserProperty = (_TOKEN_PROPERTY, token)
     return properties
 
 

@@ -38,6 +38,8 @@ class Message:
     correlation: bytes | None = None
     #: seconds until the message expires; None if it never does
     expiry: float | None = None
+    #: a token of the robot, which shows how old a request is; None if there is none
+    token: str | None = None
 
 
 @frozen
@@ -57,6 +59,8 @@ class Presence:
     server: JsonObject | None = None
     #: version of the bridge; "" if the robot is offline
     version: str = ""
+    #: whether the robot's replies to `hello` contain tokens
+    tokens: bool = False
 
     @classmethod
     def read(cls, name: str, payload: bytes) -> Presence | None:

@@ -120,10 +120,11 @@ def test_a_growing_text_continues_after_the_broker_was_killed(
 @pytest.mark.parametrize("way", ["to_client", "to_broker"])
 def test_a_goal_is_spoken_once_if_its_request_or_reply_is_lost(robot: Robot, way: Direction) -> None:
     with Proxy(robot.broker.port) as proxy, Fleet(robot.broker.url_at(proxy.port)).robot("anna") as client:
-        proxy.hold(way)
+        held = proxy.hold_from(way, b'"PENDING"' if way == "to_client" else b'"say"')
         states: list[str] = []
         saying = threading.Thread(target=lambda: states.append(client.say("only once").wait().state.name))
         saying.start()
+        assert held.wait(PATIENCE)
         if way == "to_client":
             robot.talk.watcher.wait_for(None, "SUCCEEDED")
         proxy.cut()

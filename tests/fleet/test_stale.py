@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import signal
 import time
 from typing import TYPE_CHECKING
 
@@ -91,6 +93,51 @@ def test_a_goal_that_may_be_old_is_refused_if_no_echo_returns(proxied: tuple[Rob
         assert olga.reply(early)["ok"]
         assert olga.reply(late)["error"]["code"] == "stale"
     assert robot.spoken == ["in time"]
+
+
+def test_a_sentence_is_accepted_with_a_token_of_this_run_of_the_bridge_only(robot: Robot) -> None:
+    with RemoteClient(robot.broker, "olga") as olga, robot.listen("request/+") as listener:
+        olga.ask("hello")
+        (token,) = [value for message in olga.listener.messages for name, value in message.user if name == "talk-token"]
+        assert token.startswith(robot.bridge.await_online()["session"])
+        for seq, value in ((10, token), (11, f"another {token.split()[1]}")):
+            olga.send({"seq": seq, "request": "say", "text": f"from {seq}"}, user=[("talk-token", value)])
+        assert olga.reply(10)["ok"]
+        assert olga.reply(11)["error"]["code"] == "stale"
+        assert robot.desk("say", "--wait", "from a desk").code == 0
+        sent = listener.await_message(lambda message: b"from a desk" in message.payload)
+        assert [name for name, _ in sent.user] == ["talk-token"]
+    assert robot.spoken == ["from 10", "from a desk"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("stalled", "seconds"), [*(("desk", each) for each in (8, 13, 20, 40)), ("broker", 12)])
+def test_nothing_is_spoken_late_if_a_desks_connection_or_the_broker_stalls(
+    robot: Robot, stalled: str, seconds: float
+) -> None:
+    """One desk has requested a token when the stall begins, and the other one has just sent its sentence."""
+    with contextlib.ExitStack() as stack:
+        proxies = [stack.enter_context(Proxy(robot.broker.port)) for _ in range(2)]
+        desks = [stack.enter_context(Desk(robot.broker, port=proxy.port)) for proxy in proxies]
+        clients = []
+        for request, proxy, desk in zip((b'"hello"', b'"say"'), proxies, desks, strict=True):
+            is_held = proxy.hold_from("to_broker", request)
+            clients.append(desk.start("--robot", "anna", "say", "--wait", "--", "spoken late"))
+            assert is_held.wait(10)
+        if stalled == "broker":
+            os.kill(robot.broker.pid, signal.SIGSTOP)
+            stack.callback(os.kill, robot.broker.pid, signal.SIGCONT)
+            for proxy in proxies:
+                proxy.release()
+        time.sleep(seconds)
+        os.kill(robot.broker.pid, signal.SIGCONT)
+        for proxy in proxies:
+            proxy.release()
+        ends = [desk.finish(client, timeout=60) for desk, client in zip(desks, clients, strict=True)]
+        robot.bridge.await_online()
+        assert robot.desk("say", "--wait", "--connect-timeout", "20", "control").code == 0
+    assert all(each.code in (3, 12) for each in ends), ends
+    assert robot.spoken == ["control"]
 
 
 def test_the_expiry_of_a_message_also_limits_the_wait_in_the_queue(robot: Robot) -> None:

@@ -32,7 +32,9 @@ class SessionsWithoutBroker:
         self._more = asyncio.Event()
         self._boottime = boottime
         self._policy = policy.Policy("anna", policy.ALLOWABLE_REQUESTS)
-        self.sessions: RemoteSessions = RemoteSessions("anna", socket, self._publish, lambda: room, lambda: None)
+        self.sessions: RemoteSessions = RemoteSessions(
+            "anna", socket, self._publish, lambda: room, lambda: None, lambda: "token"
+        )
 
     def post(self, fields: object, session: str = "s1", *, correlation: bytes | None = None) -> None:
         """Send an object or bytes as a request. An empty payload is a goodbye.

@@ -20,7 +20,7 @@ from tests.support.surroundings import clean_environment, dying_with_parent, fin
 from tests.support.watcher import wait_for_first
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from paho.mqtt.client import Client, MQTTMessage
 
@@ -117,6 +117,7 @@ class Listener(Resource):
         response: str | None = None,
         correlation: bytes | None = None,
         expiry: int | None = None,
+        user: Sequence[tuple[str, str]] = (),
     ) -> int:
         """Publish, and return the reason code of the acknowledgement, or 0 with `qos` 0."""
         from paho.mqtt.packettypes import PacketTypes
@@ -129,6 +130,8 @@ class Listener(Resource):
             properties.CorrelationData = correlation
         if expiry is not None:
             properties.MessageExpiryInterval = expiry
+        if user:
+            properties.UserProperty = list(user)
         data = payload if isinstance(payload, str | bytes) else json.dumps(payload, ensure_ascii=False)
         number = self._client.publish(topic, data, qos, retain, properties).mid
         self._await(lambda: number in self._codes, f"acknowledgement of {topic}")

@@ -197,6 +197,28 @@ def test_a_stale_sentence_is_refused_but_a_stale_cancel_is_accepted() -> None:
     assert accepted(decide(request({"request": "cancel"}), stale=True)).request == Cancel()
 
 
+@pytest.mark.parametrize(
+    ("token", "stale"),
+    [
+        *((f"5e55 {NOW - age}", False) for age in (0, 6)),
+        *((f"5e55 {NOW - age}", True) for age in (6.01, -0.01)),
+        *(
+            (token, True)
+            for token in (f"another {NOW}", "5e55 nan", "5e55 x", "5e55", "", f" {NOW}", "5e55 " + "9" * 5000)
+        ),
+    ],
+)
+@pytest.mark.parametrize("newest_echo_at", [0.0, NOW])
+def test_a_sentence_is_as_old_as_its_token_whatever_the_echo_says(
+    token: str, stale: bool, newest_echo_at: float
+) -> None:
+    rules = Policy("anna", policy.ALLOWABLE_REQUESTS, "5e55")
+    rules.newest_echo_at = newest_echo_at
+    assert rules.new_token(NOW) == f"5e55 {NOW}"
+    decision = rules.decide(request(token=token), topics.REQUEST, "bob", NOW)
+    assert (isinstance(decision, Refusal) and decision.error.code == "stale") == stale
+
+
 # Maximum age
 
 

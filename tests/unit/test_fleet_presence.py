@@ -15,7 +15,7 @@ SERVER = {"boot": "7r2z", "pid": 4711, "version": "0.1.0"}
 HERE = {
     "talk": 1, "version": "0.2.0", "online": True, "session": "9b51", "since": 1767225600.25,
     "groups": ["all", "warehouse"], "allow": ["say", "cancel"], "server": SERVER,
-    "later": "a field that is not known yet",
+    "tokens": True, "later": "a field that is not known yet",
 }  # fmt: skip
 LAST = {"id": "door-17", "state": "ABORTED", "reason": "player", "text": "the door", "at": 1767225601.5}
 STATUS = {"active": "a-1", "text": "hello", "pending": 3, "paused": True, "last": LAST}
@@ -34,7 +34,7 @@ def status(fields: object) -> RobotStatus | None:
 def test_a_presence_is_read_and_written_back() -> None:
     parsed = presence(HERE)
     assert parsed == Presence(
-        "anna", True, "9b51", 1767225600.25, ("all", "warehouse"), ("say", "cancel"), SERVER, "0.2.0"
+        "anna", True, "9b51", 1767225600.25, ("all", "warehouse"), ("say", "cancel"), SERVER, "0.2.0", True
     )
     assert parsed.to_json() == {name: value for name, value in HERE.items() if name not in ("talk", "later")}
     will = {"talk": 1, "online": False, "session": "9b51", "groups": ["all", "night"]}

@@ -128,9 +128,9 @@ class Bridge:
         groups = tuple(dict.fromkeys((topics.ALL_ROBOTS, *settings.groups)))
         #: the presence that this bridge publishes, except for the state of the server
         self._presence = Presence(
-            settings.name, True, self._session, self._since, groups, settings.allow, version=__version__
+            settings.name, True, self._session, self._since, groups, settings.allow, version=__version__, tokens=True
         )
-        self._policy = Policy(settings.name, settings.allow)
+        self._policy = Policy(settings.name, settings.allow, self._session)
         self._systemd = ServiceManager(self._loop, self._describe_status)
         self._sessions = RemoteSessions(
             settings.name,
@@ -138,6 +138,7 @@ class Bridge:
             self._publish,
             self._max_payload,
             self._systemd.schedule_status,
+            lambda: self._policy.new_token(boottime()),
             with_text=settings.with_text,
         )
         self._publisher = Publisher(self._sessions, self._publish_to_all, self._on_server_change)

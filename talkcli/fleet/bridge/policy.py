@@ -35,7 +35,8 @@ ALLOWABLE_REQUESTS = tuple(each for each in REQUEST_TYPES if each not in (*ALWAY
 
 #: How often the bridge sends an echo to itself.
 ECHO_EVERY_S = 5.0
-#: A message is stale if the newest returned echo is older than this. The extra second is for transmission.
+#: A message is stale if its token, or the newest returned echo, is older than this. The extra second is for
+#: transmission.
 STALE_AFTER_S = ECHO_EVERY_S + 1.0
 #: Maximum number of pending goals from remote clients. The server's queue has 100 places by default. The others
 #: are left to local clients.
@@ -113,15 +114,20 @@ class Policy:
     message that arrives after an echo must have been forwarded after the echo was sent. Therefore, the age of the
     newest returned echo limits the delay of the next message. There is no need to compare the clocks of different
     machines.
+
+    Echoes don't show how long a message took to reach the broker. Therefore, a client can send a token with a message.
+    The robot has created the token shortly before, so the message can't be older than the token.
     """
 
-    def __init__(self, name: str, allow: Collection[str]) -> None:
+    def __init__(self, name: str, allow: Collection[str], session: str = "") -> None:
         """Create the policy of one robot.
 
         Args:
             name: the robot's name.
             allow: requests that the robot accepts, in addition to `ALWAYS_ALLOWED`.
+            session: the random id of the bridge process, which is part of its tokens.
         """
+        self._session = session
         self._name = name
         self._allow = {*allow, *ALWAYS_ALLOWED}
         #: when the newest returned echo was sent, or when the connection was opened, by the `boottime` clock
@@ -136,6 +142,10 @@ class Policy:
             sent_at = float(sent_at_text)
             if self.newest_echo_at < sent_at <= now:
                 self.newest_echo_at = sent_at
+
+    def new_token(self, now: float) -> str:
+        """Return a token that shows that a message with this token was sent after `now`."""
+        return f"{self._session} {now}"
 
     def decide(self, message: Message, kind: str, user: str, now: float) -> RemoteRequest | Refusal | Goodbye | Ignored:
         """Decide whether a message is accepted, refused or ignored, or ends its client's session.
@@ -166,7 +176,7 @@ class Policy:
             if not repeatable:
                 raise BadRequest(f"correlation data must have at most {MAX_CORRELATION_BYTES} bytes", "bad_field")
             request = read_request(fields)
-            self._check_request(request, now)
+            self._check_request(request, message.token, now)
         except BadRequest as error:
             line = encode(failure(seq, error.code, error.message))
             reply = None if reply_topic is None else Message(reply_topic, line, correlation=correlation)
@@ -175,17 +185,31 @@ class Policy:
         size = 0 if kind == topics.PLAIN_CANCEL else len(message.payload)
         return RemoteRequest(user, reply_topic, seq, request, correlation, size, start_by)
 
-    def _check_request(self, request: Request, now: float) -> None:
-        """Raise BadRequest if the robot doesn't accept a request from the broker."""
+    def _check_request(self, request: Request, token: str | None, now: float) -> None:
+        """Raise BadRequest if the robot doesn't accept a request from the broker. Check the token of a `say`."""
         needed = Say.kind if request.kind in ALLOWED_WITH_SAY else request.kind
         if needed not in self._allow:
             words = f"this robot's bridge does not allow {needed} requests; add {needed} to its --allow"
             raise BadRequest(words, "not_allowed")
         if isinstance(request, Pause) and request.while_connected:
             raise BadRequest("over a broker, a pause can't end with the connection; use 'seconds'", "bad_option")
-        if isinstance(request, Say) and now - self.newest_echo_at > STALE_AFTER_S:
-            words = "the connection to the broker stalled; send the sentence again if it is still true"
-            raise BadRequest(words, STALE_CODE)
+        if isinstance(request, Say) and self._is_stale(token, now):
+            limit = f"{STALE_AFTER_S:g} s"
+            why = f"the sentence may be more than {limit} old, because the broker or a connection to it stalled"
+            raise BadRequest(f"{why}; send it again if it is still true", STALE_CODE)
+
+    def _is_stale(self, token: str | None, now: float) -> bool:
+        """Return whether a message may be too old, according to its token, or to the newest echo without a token.
+
+        The time in the token of another bridge process can't be compared, so such a message counts as too old.
+        """
+        if token is None:
+            return now - self.newest_echo_at > STALE_AFTER_S
+        session, _, made_at = token.partition(" ")
+        try:
+            return session != self._session or not 0 <= now - float(made_at) <= STALE_AFTER_S
+        except ValueError:
+            return True
 
 
 def _parse_request_fields(kind: str, payload: bytes) -> JsonObject:

@@ -22,7 +22,7 @@ from talkcli.fleet.bridge import policy
 from talkcli.fleet.bridge.local import LocalConnection
 from talkcli.fleet.link import boottime
 from talkcli.fleet.payloads import Message
-from talkcli.frozen import replace
+from talkcli.frozen import frozen, replace
 from talkcli.goals.goal import By, Goal, Sender
 from talkcli.goals.options import SHOWN_OPTIONS, Append, Cancel, Log, Pause, Say, Set
 from talkcli.goals.states import State
@@ -65,6 +65,7 @@ class RemoteSessions:
         publish: Callable[[Message, int], None],
         max_payload: Callable[[], int],
         on_change: Callable[[], None],
+        new_token: Callable[[], str],
         *,
         with_text: bool = True,
     ) -> None:
@@ -76,11 +77,12 @@ class RemoteSessions:
             publish: publishes lines for a client, with a QoS of 0 or 1.
             max_payload: returns the size of the largest payload that the broker accepts, in bytes.
             on_change: called when the number of pending goals may have changed.
+            new_token: returns a new token, which shows a client's requests to be recent.
             with_text: whether the status, the events and the answers to `watch`, to `log` and to a `status` with an id
                 contain the texts of goals.
         """
         self.name, self.socket, self.with_text = name, socket, with_text
-        self.publish, self.max_payload = publish, max_payload
+        self.publish, self.max_payload, self.new_token = publish, max_payload, new_token
         self.ids, self.goals = policy.SentIds(), policy.RemoteGoals()
         #: limits the number of connections that are waiting for the server's greeting
         self.dialing = asyncio.Semaphore(MAX_SESSIONS)
@@ -212,6 +214,15 @@ class RemoteSessions:
         self.handle_pending_change()
 
 
+@frozen
+class _ReplyLine:
+    """A line for a client, with the properties of its MQTT message."""
+
+    line: bytes
+    correlation: bytes | None = None
+    token: str | None = None
+
+
 class _RemoteExchange(Exchange):
     """A remote client's request that was sent to the server."""
 
@@ -316,7 +327,7 @@ class RemoteSession:
     def send_alive(self) -> None:
         """Tell the client if one of its goals is still waiting for room in the server's queue."""
         if self._find_waiting():
-            self._publish([(_ALIVE, None)])
+            self._publish([_ReplyLine(_ALIVE)])
 
     @property
     def _exchanges(self) -> list[_RemoteExchange]:
@@ -454,7 +465,7 @@ class RemoteSession:
 
     def _receive(self, lines: list[bytes]) -> None:
         """Process lines from the server, and publish them for the client."""
-        answers: list[tuple[bytes, bytes | None]] = []
+        answers: list[_ReplyLine] = []
         for line in lines:
             try:
                 message = decode(line)
@@ -468,14 +479,14 @@ class RemoteSession:
                 if is_result and isinstance(goal := message.get("goal"), dict):
                     self._awaited.discard(str(goal.get("id")))
                 if is_result or self._sessions.with_text or message.get("id") in self._awaited:
-                    answers.append((line + b"\n", None))
+                    answers.append(_ReplyLine(line + b"\n"))
                 elif message["event"] not in {"text", "word"}:
-                    answers.append((encode(policy.without_texts(message, policy.PRIVATE_FIELDS)), None))
+                    answers.append(_ReplyLine(encode(policy.without_texts(message, policy.PRIVATE_FIELDS))))
         self._publish(answers)
         self._end_if_done()
 
-    def _process_answer(self, message: JsonObject) -> list[tuple[bytes, bytes | None]]:
-        """Process one line of an answer. Return the lines for the client and their correlation data."""
+    def _process_answer(self, message: JsonObject) -> list[_ReplyLine]:
+        """Process one line of an answer. Return the lines for the client. Add a token to the answer to `hello`."""
         assert self._server
         exchange = self._server.match(message)
         if not isinstance(exchange, _RemoteExchange):
@@ -499,7 +510,9 @@ class RemoteSession:
             count = message.get("count")
             if found and isinstance(count, int):
                 message["count"] = count + len(found)
-        return [(encode(item(remote_request.seq, **each)), remote_request.correlation) for each in (*found, message)]
+        token = self._sessions.new_token() if isinstance(request, Hello) else None
+        lines = [encode(item(remote_request.seq, **each)) for each in (*found, message)]
+        return [_ReplyLine(each, remote_request.correlation, token) for each in lines]
 
     def _record_say_reply(self, exchange: _RemoteExchange, state: State | None, *, refused: bool) -> None:
         """Process the reply to a `say` request. Record whether its goal is pending.
@@ -516,7 +529,7 @@ class RemoteSession:
 
     def refuse(self, request: RemoteRequest, code: str, message: str) -> None:
         """Answer a client's request with an error."""
-        self._publish([(encode(failure(request.seq, code, message)), request.correlation)])
+        self._publish([_ReplyLine(encode(failure(request.seq, code, message)), request.correlation)])
 
     def end_goal(
         self, remote_request: RemoteRequest, say: Say, state: State, reason: str, message: str, by: By | None = None
@@ -536,35 +549,37 @@ class RemoteSession:
         goal_id, sender, now = say.id or self._new_goal_id(), Sender(name=policy.sender_name(self._user)), time.time()
         goal = Goal(goal_id, state, say.text, reason, by, message, client=sender, queued_at=now, ended_at=now)
         goal = replace(goal, **{name: getattr(say, name) for name in SHOWN_OPTIONS})
-        lines = [(encode(ok(remote_request.seq, goal=goal.to_json())), remote_request.correlation)]
+        lines = [_ReplyLine(encode(ok(remote_request.seq, goal=goal.to_json())), remote_request.correlation)]
         if say.wait or say.feedback:
             events = StateChanged(goal_id, state, now).to_json(), Result(goal).to_json()
-            lines += [(encode(each), None) for each in events]
+            lines += [_ReplyLine(encode(each)) for each in events]
         self._publish(lines)
         return goal
 
     def _send_gone(self, why: str) -> None:
         """Tell the client that the session has ended."""
-        self._publish([(encode({"event": "gone", "message": why}), None)])
+        self._publish([_ReplyLine(encode({"event": "gone", "message": why}))])
 
-    def _publish(self, lines: list[tuple[bytes, bytes | None]]) -> None:
-        """Publish lines for the client, with their correlation data.
+    def _publish(self, lines: list[_ReplyLine]) -> None:
+        """Publish lines for the client.
 
-        Consecutive lines with the same correlation data are published in one message if they fit.
+        Consecutive lines with the same properties are published in one message if they fit.
         """
         if self._reply_topic is None:
             return
         limit = self._sessions.max_payload()
-        payload, current, reliable = b"", None, False
-        for whole, correlation in lines:
-            line = whole if len(whole) <= limit else self._shorten_line(whole, limit)
-            if payload and (correlation != current or len(payload) + len(line) > limit):
-                self._sessions.publish(Message(self._reply_topic, payload, correlation=current), int(reliable))
-                payload, reliable = b"", False
-            payload, current = payload + line, correlation
+        message, reliable = Message(self._reply_topic, b""), False
+        for each in lines:
+            line = each.line if len(each.line) <= limit else self._shorten_line(each.line, limit)
+            same = (each.correlation, each.token) == (message.correlation, message.token)
+            if message.payload and not (same and len(message.payload) + len(line) <= limit):
+                self._sessions.publish(message, int(reliable))
+                message, reliable = replace(message, payload=b""), False
+            payload = message.payload + line
+            message = replace(message, payload=payload, correlation=each.correlation, token=each.token)
             reliable = reliable or not line.startswith(_UNRELIABLE)
-        if payload:
-            self._sessions.publish(Message(self._reply_topic, payload, correlation=current), int(reliable))
+        if message.payload:
+            self._sessions.publish(message, int(reliable))
 
     def _shorten_line(self, line: bytes, limit: int) -> bytes:
         """Shorten a line that is too long for the broker. Return the new line.

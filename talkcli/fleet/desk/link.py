@@ -201,7 +201,14 @@ class DeskLink:
             await self.poll(left, interrupt)
 
     def send(
-        self, request: Request, number: int, to: str, on_refused: Callable[[TalkError], None], *, is_group: bool = False
+        self,
+        request: Request,
+        number: int,
+        to: str,
+        on_refused: Callable[[TalkError], None],
+        *,
+        is_group: bool = False,
+        token: str | None = None,
     ) -> bool:
         """Send a request to a robot or a group. Return whether it was sent.
 
@@ -212,6 +219,7 @@ class DeskLink:
             on_refused: a function that is called with the error if the request is too long, or if the broker rejects it
                 later.
             is_group: whether `to` is a group.
+            token: the robot's latest token, which shows that the request is recent.
         """
         if self.link is None:
             return False
@@ -228,7 +236,7 @@ class DeskLink:
             return False
         expiry = (request.ttl or None) if isinstance(request, Say) else _REQUEST_EXPIRY_S
         topic, response = self._topics(to, is_group=is_group)
-        message = Message(topic, line, response=response, expiry=expiry)
+        message = Message(topic, line, response=response, expiry=expiry, token=token)
         return self.link.publish(message, on_acknowledged=on_acknowledged)
 
     def end_session(self, to: str, *, is_group: bool = False) -> None:

@@ -8,6 +8,7 @@ state.
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections import deque
@@ -48,6 +49,9 @@ if TYPE_CHECKING:
 
 #: How often to send a message that keeps the bridge's session alive. The bridge ends a session after 90 s of silence.
 _KEEP_ALIVE_INTERVAL_S = 30.0
+#: If the last token is older than this, the desk requests a new one before it sends a `say`. The robot accepts a token
+#: for 6 s, so the message has at least 3 s left to arrive.
+_FRESH_TOKEN_S = 3.0
 #: How many times a request may be sent again. The limit matters if the request itself breaks the connection.
 _MAX_RESENDS = 5
 #: The pause between two attempts to connect, if `keep_trying_s` is set.
@@ -125,6 +129,14 @@ class RobotConnection(Connection):
         self._canceled: set[str] = set()
         #: queued lookups of goals, which are sent when earlier ones have been answered
         self._lookups: deque[Exchange] = deque()
+        #: the robot's latest token, and when it was requested (by the `boottime` clock); None if there is none
+        self._token: tuple[str, float] | None = None
+        #: the token in the message that is being processed
+        self._received_token: str | None = None
+        #: requests that are sent, in this order, after the robot has sent a token
+        self._awaiting_token: deque[Exchange] = deque()
+        #: the request for a token that hasn't been answered yet
+        self._token_request: Exchange | None = None
 
     @classmethod
     async def open(cls, robot: str, broker: Broker, *, keep_trying_s: float = 0.0, **options: Any) -> Self:
@@ -190,19 +202,88 @@ class RobotConnection(Connection):
         return self._publish(exchange)
 
     def _publish(self, exchange: Exchange) -> bool:
-        """Send a request if the robot isn't absent. Return whether it was sent."""
+        """Send a request if the robot isn't absent. Return whether it was sent.
+
+        If a `say` needs a new token, it is sent later. Requests after it wait, too, so that they arrive in order.
+        """
+        if self.ended is not None or self.absent_since is not None:
+            return False
+        if not (self._awaiting_token or self._needs_token(exchange.request)):
+            return self._send_now(exchange)
+        self._awaiting_token.append(exchange)
+        if self._token_request is None:
+            self._request_token()
+        return False
+
+    def _send_now(self, exchange: Exchange) -> bool:
+        """Send a request with the robot's latest token, if any. Return whether it was sent."""
 
         def on_refused(error: TalkError) -> None:
             with self.changed:
                 self.fail(exchange, error)
 
-        if self.ended is not None or self.absent_since is not None:
-            return False
-        if not self._desk.send(exchange.request, exchange.number, self.robot, on_refused):
+        token = self._token[0] if self._token and isinstance(exchange.request, Say) else None
+        if not self._desk.send(exchange.request, exchange.number, self.robot, on_refused, token=token):
             return False
         self._published_at = time.monotonic()
         exchange.sent = True
         return True
+
+    # -- tokens
+
+    @property
+    def awaits_token(self) -> bool:
+        """Whether requests are waiting for a token from the robot."""
+        return self._token_request is not None
+
+    def _needs_token(self, request: Request) -> bool:
+        """Return whether a new token must be requested before a request can be sent."""
+        if not isinstance(request, Say) or self._presence.get("tokens") is not True:
+            return False
+        return self._token is None or boottime() - self._token[1] > _FRESH_TOKEN_S
+
+    def _request_token(self) -> None:
+        """Request a token from the robot, and then send the requests that wait for it."""
+        requested_at = boottime()
+
+        def on_reply(_reply: JsonObject, _items: list[JsonObject]) -> None:
+            self._token = (self._received_token, requested_at) if self._received_token else None
+            self._send_waiting(None)
+
+        self._token_request = Exchange(Hello(self._sender), on_reply, self._send_waiting)
+        self.register(self._token_request, time.monotonic())
+        self._send_now(self._token_request)
+
+    def _send_waiting(self, error: TalkError | None) -> None:
+        """Send the requests that have waited for a token. If there is an error instead of a token, fail each `say`."""
+        while self._awaiting_token:
+            exchange = self._awaiting_token.popleft()
+            request = exchange.request
+            exchange.heard_at = time.monotonic()
+            if error and isinstance(request, Say):
+                self.fail(exchange, error)
+            elif isinstance(exchange, RobotExchange) and isinstance(request, Say) and request.ttl:
+                left = (exchange.expires_at or 0.0) - boottime()
+                # Rounding up keeps a usual ttl unchanged, unless the token was late.
+                exchange.request = replace(request, ttl=min(request.ttl, math.ceil(left * 10) / 10))
+                if left > 0:
+                    self._send_now(exchange)
+                else:
+                    self.fail(exchange, self.unanswered(exchange))
+            else:
+                self._send_now(exchange)
+        self._token_request = None
+
+    def forget(self, exchange: Exchange) -> bool:
+        """Drop an exchange, even if it is still waiting for a token.
+
+        The result is that of `ClientCore.forget`.
+        """
+        if exchange in self._awaiting_token:
+            self._awaiting_token.remove(exchange)
+        return super().forget(exchange)
+
+    # -- time limits
 
     def answer_deadline(self, exchange: Exchange) -> float:
         """Return the time at which an exchange fails if its robot stays silent or absent."""
@@ -273,6 +354,7 @@ class RobotConnection(Connection):
             if message.topic == topics.robot(self.robot, topics.PRESENCE):
                 self._update_presence(message.payload)
             else:
+                self._received_token = message.token
                 self.receive(message.payload, time.monotonic())
 
     def _mark_absent(self, why: str, error: type[ServerUnavailable] = ServerUnavailable) -> None:
@@ -330,6 +412,8 @@ class RobotConnection(Connection):
     def _resume_requests(self) -> None:
         """Resume open requests after an absence. Resend them, look up their goals, or report failure."""
         now = time.monotonic()
+        self._token = self._token_request = None
+        self._awaiting_token.clear()
         if self._sender:
             self._send_without_answer(Hello(self._sender))
         if self._canceled:

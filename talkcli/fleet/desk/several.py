@@ -45,7 +45,7 @@ _CHECK_INTERVAL_S = 0.25
 #: The maximum number of messages to process before a check for late robots. There may be many messages if this process
 #: was suspended.
 _MAX_MESSAGES_PER_CHECK = 5000
-#: How long `close` waits for the broker to acknowledge the request.
+#: How long to wait for the tokens of robots, and how long `close` waits for the broker to acknowledge the request.
 _FLUSH_LIMIT_S = 1.0
 
 
@@ -140,6 +140,7 @@ class FleetRequestCalls:
             self._expires_at = boottime() + ttl if ttl else None
             self._began, self._next_check = True, time.monotonic() + _CHECK_INTERVAL_S
             self._send_to_known_robots()
+            await self._await_tokens()
         except BaseException:
             await self._close()
             raise
@@ -196,6 +197,7 @@ class FleetRequestCalls:
         """Send all queued messages, and close the connection. This doesn't cancel the request."""
         began, self._began, self._closed = self._began, False, True
         if began:
+            await self._await_tokens()
             await self._desk.flush(_FLUSH_LIMIT_S)
             if self._selection.group is not None:
                 self._desk.end_session(self._selection.group, is_group=True)
@@ -204,6 +206,14 @@ class FleetRequestCalls:
                     if each.was_asked:
                         each.connection.end_session()
         self._desk.close()
+
+    async def _await_tokens(self) -> None:
+        """Wait until the sentence has been sent to all robots from which a token was requested, but not for long."""
+        end = time.monotonic() + _FLUSH_LIMIT_S
+        while self._desk.link and any(each.connection.awaits_token for each in self._robots.values()):
+            if (left := end - time.monotonic()) <= 0:
+                break
+            await self._desk.poll(left)
 
     def _send_to_known_robots(self) -> None:
         """Send the request to the group, or to each selected robot that is known."""
