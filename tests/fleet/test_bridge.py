@@ -49,9 +49,9 @@ def texts_before(client: RemoteClient, talk: Talk) -> list[str]:
 
 
 def fill_queue(robot: Robot, client: RemoteClient) -> None:
-    """Pause the robot, and use all places for remote goals."""
+    """Pause the robot, and use all places that one user may have."""
     robot.talk.request("pause")
-    assert [client.say(f"{number}")["state"] for number in range(20)] == ["PENDING"] * 20
+    assert [client.say(f"{number}")["state"] for number in range(15)] == ["PENDING"] * 15
 
 
 def is_reply(topic: str, number: int, message: Published) -> bool:
@@ -157,32 +157,32 @@ def test_a_request_is_refused_only_if_it_is_too_long_for_the_server(client: Remo
 # Places in the queue
 
 
-def test_remote_clients_have_20_places_in_the_queue(shared_robot: Robot, client: RemoteClient) -> None:
+def test_a_remote_user_has_15_of_20_places_in_the_queue(shared_robot: Robot, client: RemoteClient) -> None:
     shared_robot.talk.request("pause")
     goals = [client.say(f"flood {number}", wait=True) for number in range(25)]
-    assert [goal["state"] for goal in goals] == ["PENDING"] * 20 + ["REJECTED"] * 5
-    assert {goal["reason"] for goal in goals[20:]} == {"queue_full"}
+    assert [goal["state"] for goal in goals] == ["PENDING"] * 15 + ["REJECTED"] * 10
+    assert {goal["reason"] for goal in goals[15:]} == {"queue_full"}
     ended = client.result(goals[-1]["id"])
     assert (ended["state"], ended["text"]) == ("REJECTED", "flood 24")
     with RemoteClient(shared_robot.broker, "eve") as eve:
-        assert eve.say("another's")["reason"] == "queue_full"
+        assert [eve.say(f"another's {number}")["state"] for number in range(5)] == ["PENDING"] * 4 + ["REJECTED"]
     own = shared_robot.talk.request("say", text="the robot's own")["goal"]
     assert own["state"] == "PENDING"
-    assert client.ask("cancel")["count"] == 21
+    assert client.ask("cancel")["count"] == 20
     fire = client.say("fire", preempt=True)
     assert fire["state"] == "PENDING"
-    goals = [client.say(f"flood {number}") for number in range(21)]
-    assert [goal["state"] for goal in goals] == ["PENDING"] * 20 + ["REJECTED"], "fire took a place"
+    goals = [client.say(f"flood {number}") for number in range(16)]
+    assert [goal["state"] for goal in goals] == ["PENDING"] * 15 + ["REJECTED"], "fire took a place"
     fire = client.say("fire", preempt=True)
     assert fire["state"] == "PENDING"
-    assert client.ask("cancel")["count"] == 21
+    assert client.ask("cancel")["count"] == 16
     assert client.say("again there is room")["state"] == "PENDING"
     client.ask("cancel")
 
 
-def test_an_active_goal_takes_none_of_the_20_places(client: RemoteClient) -> None:
+def test_an_active_goal_takes_none_of_the_places(client: RemoteClient) -> None:
     client.say("never-ends")
-    assert [client.say(f"{number}")["state"] for number in range(21)] == ["PENDING"] * 20 + ["REJECTED"]
+    assert [client.say(f"{number}")["state"] for number in range(16)] == ["PENDING"] * 15 + ["REJECTED"]
 
 
 def test_patient_goals_wait_for_room_in_their_order(shared_robot: Robot, client: RemoteClient) -> None:
@@ -212,19 +212,19 @@ def test_any_client_can_cancel_goals_that_wait_for_room(shared_robot: Robot, cli
     client.send({"seq": 100, "request": "say", "text": "patient", "patient": True, "wait": True, "id": "p"})
     client.ask("status")  # the bridge has read the request before it
     if case == "at the robot":
-        assert shared_robot.talk.request("cancel")["count"] == 20
+        assert shared_robot.talk.request("cancel")["count"] == 15
     elif case == "elsewhere":
         with RemoteClient(shared_robot.broker, "eve") as eve:
-            assert eve.ask("cancel")["count"] == 21
-            assert len([line for line in eve.lines if "canceled" in line]) == 21
+            assert eve.ask("cancel")["count"] == 16
+            assert len([line for line in eve.lines if "canceled" in line]) == 16
     else:
         fields: dict[str, Any] = {"ids": ["p"]} if case == "by its id" else {}
         reply = client.ask("cancel", **fields)
-        assert (reply["ok"], reply["count"]) == (True, 1 if fields else 21)
+        assert (reply["ok"], reply["count"]) == (True, 1 if fields else 16)
     goal = client.reply(100)["goal"]
     assert (goal["id"], goal["state"], goal["reason"]) == ("p", "RECALLED", "canceled")
     assert client.result("p")["by"]["client"]
-    assert len(robot_goals(shared_robot)) == (20 if case == "by its id" else 0)
+    assert len(robot_goals(shared_robot)) == (15 if case == "by its id" else 0)
 
 
 def test_a_goodbye_recalls_goals_that_wait_for_room_and_disconnects(shared_robot: Robot, client: RemoteClient) -> None:
@@ -238,7 +238,7 @@ def test_a_goodbye_recalls_goals_that_wait_for_room_and_disconnects(shared_robot
         while wire.request("status")["server"]["clients"] >= before:
             assert time.monotonic() < end, "the bridge keeps its connection to the server"
     with RemoteClient(shared_robot.broker, "eve") as eve:
-        assert eve.ask("cancel")["count"] == 20
+        assert eve.ask("cancel")["count"] == 15
         assert eve.say("next")["state"] == "PENDING"
         assert [goal["text"] for goal in robot_goals(shared_robot)] == ["next"]
         eve.ask("cancel")

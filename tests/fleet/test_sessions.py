@@ -172,6 +172,33 @@ async def test_a_cancel_ends_the_longest_silent_session(talk: Talk, pass_time: C
 
 
 @in_loop
+async def test_a_user_has_8_sessions_while_another_user_needs_a_place(
+    talk: Talk, pass_time: Callable[[float], None]
+) -> None:
+    anna = SessionsWithoutBroker(talk.socket)
+    for number in range(32):
+        await anna.ask({"seq": 1, "request": "watch"}, f"w{number}")
+        pass_time(0.1)
+    for number in range(10):
+        assert (await anna.ask(say(2, wait=True), f"olga/s{number}"))["ok"] == (number < 8)
+    assert (await anna.ask({"seq": 2, "request": "log"}, "another"))["error"]["code"] == "busy"
+    left = [number for number in range(32) if not any(line.get("event") == "gone" for line in anna.lines(f"w{number}"))]
+    assert left == [*range(8, 32)]
+    anna.sessions.end_all()
+
+
+@in_loop
+async def test_waiting_goals_of_a_user_do_not_delay_other_users(talk: Talk) -> None:
+    anna = SessionsWithoutBroker(talk.socket)
+    for number in range(40):
+        anna.post(say(number, patient=True))
+    assert [(await anna.ask(say(number), "olga/s1"))["goal"]["state"] for number in range(2)] == ["PENDING"] * 2
+    anna.post(say(2, patient=True), "olga/s1")
+    assert (await anna.line(lambda line: line.get("seq") == 2, "olga/s1"))["goal"]["state"] == "PENDING"
+    anna.sessions.end_all()
+
+
+@in_loop
 async def test_clients_of_a_hung_server_take_32_connections_and_no_threads() -> None:
     """A closed connection stays in the backlog. A client that leaves before its turn is never connected."""
     with short_directory() as directory, socket.socket(socket.AF_UNIX) as listening:
@@ -239,13 +266,13 @@ async def test_requests_of_all_clients_are_limited_to_4_mib_except_cancels(talk:
     blanks = b" " * 60_000
     line = json.dumps({"seq": 1, "request": "say", **long}).encode()
     refused = []
-    for session in range(3):
-        for _ in range(40):
-            anna.post(line + blanks, f"s{session}")
-        await anna.ask({"seq": 2, "request": "hello"}, f"s{session}")
-        refused.append([line for line in anna.lines(f"s{session}") if line.get("ok") is False])
-    assert [bool(lines) for lines in refused] == [False, True, True]
-    assert {line["error"]["code"] for line in refused[1]} == {"busy"}
+    for user, count in (("olga", 40), ("eve", 30), ("otto", 30)):
+        for _ in range(count):
+            anna.post(line + blanks, f"{user}/s1")
+        await anna.ask({"seq": 2, "request": "hello"}, f"{user}/s1")
+        refused.append([line for line in anna.lines(f"{user}/s1") if line.get("ok") is False])
+    assert [bool(lines) for lines in refused] == [True, False, True], "olga may only use half of the space"
+    assert {line["error"]["code"] for lines in refused for line in lines} == {"busy"}
     assert (4 << 20) - 61_000 < anna.sessions.count_waiting_bytes() <= 4 << 20
     assert (await anna.ask({"seq": 3, "request": "cancel"}, "another"))["ok"]
     assert anna.sessions.count_waiting_bytes() == 0

@@ -219,6 +219,24 @@ def test_a_sentence_is_as_old_as_its_token_whatever_the_echo_says(
     assert (isinstance(decision, Refusal) and decision.error.code == "stale") == stale
 
 
+def test_of_each_user_100_messages_in_a_second_are_processed_and_every_cancel() -> None:
+    rules = connected(NOW)
+    cancel = request({"request": "cancel"})
+
+    def is_dropped(message: Message, user: str, now: float) -> bool:
+        kind = topics.parse_request_topic(message.topic)
+        assert kind
+        decision = rules.decide(message, kind[0], user, now)
+        return isinstance(decision, Ignored) and decision.kind == "flood"
+
+    assert [is_dropped(request(response=None), "bob", NOW) for _ in range(101)] == [False] * 100 + [True]
+    assert is_dropped(request(b"hi", PLAIN, None), "bob", NOW + 0.9)
+    assert not is_dropped(request(b"", CANCEL, None), "bob", NOW)
+    assert not is_dropped(replace(cancel, response=None), "bob", NOW)
+    assert not is_dropped(request(response=None), "eve", NOW)
+    assert not is_dropped(request(response=None), "bob", NOW + 1)
+
+
 # Maximum age
 
 
@@ -328,10 +346,38 @@ def test_the_last_thousand_ids_are_stored_with_the_servers_boot_id() -> None:
     ids.discard("never known")
 
 
+@pytest.mark.parametrize(
+    ("pending", "places"),
+    [
+        ([], 15),
+        ([15], 4),
+        ([15, 4], 1),
+        ([15, 4, 1], 0),
+        ([1] * 12, 6),
+        ([5], 12),
+    ],
+)
+def test_a_user_may_have_three_pending_goals_for_each_free_place(pending: list[int], places: int) -> None:
+    ids = SentIds()
+    goals = RemoteGoals(ids)
+
+    def add(user: str) -> None:
+        goal_id = f"g{len(goals)}"
+        ids.add(goal_id, "1a1a", user)
+        goals.add(goal_id, None)
+
+    for number, count in enumerate(pending):
+        for _ in range(count):
+            add(f"user-{number}")
+    while goals.has_room(Say("a"), "bob"):
+        add("bob")
+    assert goals.count("bob") == places
+
+
 def test_twenty_goals_may_be_pending_whether_reply_or_event_arrives_first() -> None:
-    goals = RemoteGoals()
+    goals = RemoteGoals(SentIds())
     for number in range(20):
-        assert goals.has_room(Say("a"))
+        assert goals.has_room(Say("a"), "bob")
         goals.add(f"g{number}", "battery" if number == 7 else None)
         if number % 2:
             goals.record_pending(f"g{number}", "battery" if number == 7 else None)
@@ -341,13 +387,13 @@ def test_twenty_goals_may_be_pending_whether_reply_or_event_arrives_first() -> N
             goals.record_pending(f"g{number}", None)
     assert (len(goals), goals.pending_count) == (20, 19)
     sentences = [Say("a"), Say("a", key="door"), Say("a", key="battery"), Say("a", flush=True), Say("a", preempt=True)]
-    assert [goals.has_room(say) for say in sentences] == [False, False, True, True, True]
+    assert [goals.has_room(say, "bob") for say in sentences] == [False, False, True, True, True]
     goals.remove("g3")
-    assert goals.has_room(Say("a"))
+    assert goals.has_room(Say("a"), "bob")
 
 
 def test_unanswered_goals_still_count_after_a_new_watch() -> None:
-    goals = RemoteGoals()
+    goals = RemoteGoals(SentIds())
     goals.add("unanswered", None)
     goals.record_pending("ended", None)
     goals.replace_pending([("there", "k")])
@@ -363,7 +409,7 @@ def test_unanswered_goals_still_count_after_a_new_watch() -> None:
     )
 )
 def test_remote_goals_are_counted_as_in_a_simple_model(steps: list[tuple[str, int]]) -> None:
-    goals = RemoteGoals()
+    goals = RemoteGoals(SentIds())
     unanswered: set[int] = set()
     pending: set[int] = set()
     for action, number in steps:

@@ -7,6 +7,7 @@ may still be rejected by the server, which makes all decisions about speech. All
 from __future__ import annotations
 
 import contextlib
+from collections import Counter
 from typing import TYPE_CHECKING
 
 from talkcli.errors import BadRequest, LineTooLong, RequestRefused
@@ -41,6 +42,11 @@ STALE_AFTER_S = ECHO_EVERY_S + 1.0
 #: Maximum number of pending goals from remote clients. The server's queue has 100 places by default. The others
 #: are left to local clients.
 MAX_REMOTE_GOALS = 20
+#: How many messages of one user are processed in a second. Others are dropped, so that a flood can't delay other users.
+MAX_MESSAGES_PER_S = 100
+#: A user may have this many times as many pending goals as there are free places. So one user has at most 15 of the 20
+#: places, and the next user finds at least 5 free.
+_PENDING_PER_FREE_PLACE = 3
 #: How many goal ids to remember, so that no goal is spoken twice, even if the server has forgotten it.
 MAX_REMEMBERED_IDS = 1_000
 #: Maximum size of the correlation data, which is repeated in the header of each answer.
@@ -128,6 +134,8 @@ class Policy:
             session: the random id of the bridge process, which is part of its tokens.
         """
         self._session = session
+        #: number of messages from each user in the current second, and the end of this second, by the `boottime` clock
+        self._message_counts, self._second_ends_at = Counter[str](), 0.0
         self._name = name
         self._allow = {*allow, *ALWAYS_ALLOWED}
         #: when the newest returned echo was sent, or when the connection was opened, by the `boottime` clock
@@ -156,6 +164,8 @@ class Policy:
             user: the client's user name.
             now: the current time, by the `boottime` clock.
         """
+        if self._is_flood(message, kind, user, now):
+            return Ignored("flood", f"dropped messages of {user}: more than {MAX_MESSAGES_PER_S} in a second")
         if message.retained:
             return Ignored("retained", f"dropped a retained message on {message.topic}, because it may be old")
         reply_topic = None
@@ -184,6 +194,15 @@ class Policy:
         start_by = None if message.expiry is None else now + message.expiry
         size = 0 if kind == topics.PLAIN_CANCEL else len(message.payload)
         return RemoteRequest(user, reply_topic, seq, request, correlation, size, start_by)
+
+    def _is_flood(self, message: Message, kind: str, user: str, now: float) -> bool:
+        """Count a message. Return whether its user sends too many messages, and it is no `cancel`."""
+        if now >= self._second_ends_at:
+            self._message_counts.clear()
+            self._second_ends_at = now + 1.0
+        self._message_counts[user] += 1
+        is_cancel = kind == topics.PLAIN_CANCEL or b'"cancel"' in message.payload
+        return self._message_counts[user] > MAX_MESSAGES_PER_S and not is_cancel
 
     def _check_request(self, request: Request, token: str | None, now: float) -> None:
         """Raise BadRequest if the robot doesn't accept a request from the broker. Check the token of a `say`."""
@@ -277,7 +296,9 @@ class RemoteGoals:
     any order.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, ids: SentIds) -> None:
+        """Start without goals. `ids` knows the senders of the goals."""
+        self._ids = ids
         #: for each goal id: the goal's key, and whether the server has confirmed that the goal is pending
         self._goals: dict[str, tuple[str | None, bool]] = {}
 
@@ -289,18 +310,23 @@ class RemoteGoals:
         """The number of goals that the server has confirmed as pending."""
         return sum(pending for _, pending in self._goals.values())
 
+    def count(self, user: str) -> int:
+        """Return the number of a user's goals."""
+        return sum(self._ids.user_of(each) == user for each in self._goals)
+
     @staticmethod
     def counts(say: Say) -> bool:
         """Return whether a goal counts towards the limit for remote goals."""
         return not (say.preempt or say.flush)
 
-    def has_room(self, say: Say) -> bool:
-        """Return whether a goal can be sent without exceeding the limit for remote goals.
+    def has_room(self, say: Say, user: str) -> bool:
+        """Return whether a user's goal can be sent without exceeding the limit for remote goals, or the user's part.
 
         There is always room for a goal that replaces another goal with the same key.
         """
         replaces = say.key is not None and any(key == say.key for key, _ in self._goals.values())
-        return len(self) < MAX_REMOTE_GOALS or not self.counts(say) or replaces
+        free = MAX_REMOTE_GOALS - len(self)
+        return self.count(user) < _PENDING_PER_FREE_PLACE * free or not self.counts(say) or replaces
 
     def add(self, goal_id: str, key: str | None) -> None:
         """Add a goal that is being sent to the server, unless it is already known."""

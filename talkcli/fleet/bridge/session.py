@@ -12,7 +12,7 @@ from __future__ import annotations
 import asyncio
 import random
 import time
-from collections import deque
+from collections import Counter, deque
 from typing import TYPE_CHECKING
 
 from talkcli.client.core import Exchange
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 #: Maximum number of sessions. Each has a connection to the server, which accepts 256 connections by default.
 MAX_SESSIONS = 32
+#: While another user needs a place, a user with more sessions than this loses the oldest of them.
+MAX_USER_SESSIONS = 8
 #: Maximum number of unanswered requests per client.
 MAX_WAITING_REQUESTS = 64
 #: Maximum total size of all clients' unanswered requests. For `cancel` and `status`, the limit is twice as high.
@@ -83,7 +85,8 @@ class RemoteSessions:
         """
         self.name, self.socket, self.with_text = name, socket, with_text
         self.publish, self.max_payload, self.new_token = publish, max_payload, new_token
-        self.ids, self.goals = policy.SentIds(), policy.RemoteGoals()
+        self.ids = policy.SentIds()
+        self.goals = policy.RemoteGoals(self.ids)
         #: limits the number of connections that are waiting for the server's greeting
         self.dialing = asyncio.Semaphore(MAX_SESSIONS)
         #: cleared while the broker is slow, so that sessions stop reading from the server
@@ -104,7 +107,7 @@ class RemoteSessions:
         """Pass a request to its client's session, or refuse it if there are too many sessions."""
         key = request.user, request.reply_topic
         session = self._sessions.get(key) or RemoteSession(self, *key)
-        if key in self._sessions or self._make_room(urgent=isinstance(request.request, Cancel | Status)):
+        if key in self._sessions or self._make_room(request.user, urgent=isinstance(request.request, Cancel | Status)):
             self._sessions[key] = session
             session.submit(request)
         else:
@@ -134,18 +137,26 @@ class RemoteSessions:
             else:
                 session.send_alive()
 
-    def _make_room(self, *, urgent: bool) -> bool:
-        """End an idle session if there are too many. Return whether there is room for a new one.
+    def _make_room(self, user: str, *, urgent: bool) -> bool:
+        """End a session if there are too many. Return whether there is room for a new session of a user.
 
-        For an `urgent` request, any session may be ended.
+        Preferably, an idle session is ended. Otherwise, a user with few sessions takes the place of a user with many.
+        For an `urgent` request, any session may be ended. A user with many sessions only gets places of users with at
+        least as many.
         """
         if len(self._sessions) < MAX_SESSIONS:
             return True
+        counts = Counter(each.user for each in self._sessions.values())
         sessions = list(self._sessions.values())
-        candidates = [each for each in sessions if each.idle] or (sessions if urgent else [])
+        if counts[user] >= MAX_USER_SESSIONS:
+            sessions = [each for each in sessions if counts[each.user] >= counts[user]]
+            crowded = []
+        else:
+            crowded = [each for each in sessions if counts[each.user] > MAX_USER_SESSIONS]
+        candidates = [each for each in sessions if each.idle] or crowded or (sessions if urgent else [])
         if candidates:
             oldest = min(candidates, key=lambda each: each.used_at)
-            oldest.end("the session was closed to make room for an urgent request from another client")
+            oldest.end("the session was closed to make room for another client")
         return bool(candidates)
 
     # -- from the sessions
@@ -154,9 +165,14 @@ class RemoteSessions:
         """Remove a session that has ended."""
         self._sessions = {key: each for key, each in self._sessions.items() if each is not session}
 
-    def count_waiting_bytes(self) -> int:
-        """Return the total size of all clients' unanswered requests."""
-        return sum(each.size_bytes for session in self._sessions.values() for each in session.unanswered)
+    def count_waiting_bytes(self, user: str | None = None) -> int:
+        """Return the total size of the unanswered requests of a user, or of all users."""
+        sessions = [each for each in self._sessions.values() if user in (None, each.user)]
+        return sum(each.size_bytes for session in sessions for each in session.unanswered)
+
+    def has_waiting(self, user: str) -> bool:
+        """Return whether goals of a user are waiting for room."""
+        return any(session.user == user for _, _, session in self.waiting)
 
     def cancel_waiting(self, cancel: Cancel, canceled_by: By | None) -> list[Goal]:
         """Cancel the goals that wait in the bridge and match a `cancel` request. Return these goals."""
@@ -176,15 +192,22 @@ class RemoteSessions:
             self._release_handle = self._loop.call_soon(self._send_or_cancel_waiting)
 
     def _send_or_cancel_waiting(self) -> None:
-        """Send waiting goals while there is room, or cancel them if all pending goals were cancelled."""
+        """Send waiting goals while there is room, or cancel them if all pending goals were cancelled.
+
+        The goals of each user are sent in their order.
+        """
         self._release_handle = None
         canceled_by, self._canceled_by = self._canceled_by, None
         if canceled_by and not self.goals.pending_count:
             # A client has cancelled every pending goal, so cancel the waiting goals, too.
             self.cancel_waiting(Cancel(), canceled_by)
-        while self.waiting and self.goals.has_room(self.waiting[0][1]):
-            request, say, session = self.waiting.pop(0)
-            session.send_say(request, say, ignore_limit=True)
+        waiting, self.waiting = self.waiting, []
+        for each in waiting:
+            request, say, session = each
+            if self.has_waiting(session.user) or not self.goals.has_room(say, session.user):
+                self.waiting.append(each)
+            else:
+                session.send_say(request, say, ignore_limit=True)
 
     # -- from the publisher
 
@@ -257,7 +280,7 @@ class RemoteSession:
         #: when the client sent its last request, by the event loop's clock
         self.used_at = 0.0
         self._sessions = sessions
-        self._user, self._reply_topic = user, reply_topic
+        self.user, self._reply_topic = user, reply_topic
         self._name = policy.sender_name(user)
         self._loop = asyncio.get_running_loop()
         self._server: LocalConnection | None = None
@@ -285,11 +308,13 @@ class RemoteSession:
             self._said_goodbye, self._reply_topic = False, request.reply_topic
         urgent = isinstance(request.request, Cancel | Status)
         limit = 2 * MAX_WAITING_BYTES if urgent else MAX_WAITING_BYTES
+        shared = self._sessions
+        waiting_bytes = max(shared.count_waiting_bytes(), 2 * shared.count_waiting_bytes(self.user))
         if isinstance(request.request, Log) and request.request.grep is not None and not self._sessions.with_text:
             self.refuse(request, "not_allowed", "the robot's bridge hides all texts (--no-text), so leave out grep")
         elif len(self.unanswered) >= MAX_WAITING_REQUESTS:
             self.refuse(request, Busy.code, f"{MAX_WAITING_REQUESTS} requests of this client are already waiting")
-        elif self._sessions.count_waiting_bytes() + request.size_bytes > limit:
+        elif waiting_bytes + request.size_bytes > limit:
             self.refuse(request, Busy.code, f"{MAX_WAITING_BYTES >> 20} MiB of requests are already waiting")
         elif self._server:
             self._send_request(request)
@@ -365,12 +390,12 @@ class RemoteSession:
             self.send_say(remote_request, request)
         elif isinstance(request, Cancel):
             self._send_cancel(remote_request, request)
-        elif isinstance(request, Append) and (owner := self._sessions.ids.user_of(request.id)) != self._user:
+        elif isinstance(request, Append) and (owner := self._sessions.ids.user_of(request.id)) != self.user:
             code = "not_sender" if owner else "unknown_goal"
-            self.refuse(remote_request, code, f"the goal {request.id} was not sent by {self._user}")
+            self.refuse(remote_request, code, f"the goal {request.id} was not sent by {self.user}")
         else:
             if isinstance(request, Hello):
-                self._name = policy.sender_name(self._user, request.name)
+                self._name = policy.sender_name(self.user, request.name)
                 request = replace(request, name=self._name)
             self._watching = self._watching or isinstance(request, Watch)
             self._send(_RemoteExchange(remote_request, request))
@@ -387,13 +412,15 @@ class RemoteSession:
         assert server
         goal_id = say.id or self._new_goal_id()
         boot, counted = shared.ids.boot_of(goal_id), shared.goals.counts(say)
-        owner = shared.ids.user_of(goal_id) or self._user
+        owner = shared.ids.user_of(goal_id) or self.user
         if boot not in (None, server.boot):
             words = f"{goal_id} was sent to a server that has ended; it may have been spoken"
             self.refuse(remote_request, "lost", words)
-        elif say.more and owner != self._user:
-            self.refuse(remote_request, "not_sender", f"the goal {goal_id} was not sent by {self._user}")
-        elif ignore_limit or (shared.goals.has_room(say) and not (counted and shared.waiting)):
+        elif say.more and owner != self.user:
+            self.refuse(remote_request, "not_sender", f"the goal {goal_id} was not sent by {self.user}")
+        elif ignore_limit or (
+            shared.goals.has_room(say, self.user) and not (counted and shared.has_waiting(self.user))
+        ):
             request = remote_request.build_say(goal_id, boottime())
             if self._send(_RemoteExchange(remote_request, request, is_new=boot is None)):
                 shared.ids.add(goal_id, server.boot, owner, counted=counted)
@@ -402,7 +429,8 @@ class RemoteSession:
         elif say.patient:
             shared.waiting.append((remote_request, say, self))
         else:
-            words = f"{policy.MAX_REMOTE_GOALS} goals of remote clients are already waiting"
+            count, total = shared.goals.count(self.user), len(shared.goals)
+            words = f"{total} goals of remote clients are already waiting, {count} of them from {self.user}"
             # Like the server, don't give a rejected goal the id that its client has chosen.
             self.end_goal(remote_request, replace(say, id=None), State.REJECTED, "queue_full", f"not spoken: {words}")
 
@@ -546,7 +574,7 @@ class RemoteSession:
             message: the human-readable reason for the end.
             by: the client that cancelled the goal, or None.
         """
-        goal_id, sender, now = say.id or self._new_goal_id(), Sender(name=policy.sender_name(self._user)), time.time()
+        goal_id, sender, now = say.id or self._new_goal_id(), Sender(name=policy.sender_name(self.user)), time.time()
         goal = Goal(goal_id, state, say.text, reason, by, message, client=sender, queued_at=now, ended_at=now)
         goal = replace(goal, **{name: getattr(say, name) for name in SHOWN_OPTIONS})
         lines = [_ReplyLine(encode(ok(remote_request.seq, goal=goal.to_json())), remote_request.correlation)]
