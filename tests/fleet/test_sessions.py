@@ -207,11 +207,11 @@ async def test_clients_of_a_hung_server_take_32_connections_and_no_threads() -> 
         listening.settimeout(5)
         anna = SessionsWithoutBroker(f"{directory}/s")
         before = threading.active_count()
-        for _ in range(100):
+        for turn in range(100):
             for number in range(3):
-                anna.post({"seq": 1, "request": "status"}, f"s{number}")
+                anna.post({"seq": 1, "request": "status"}, f"user-{turn}/s{number}")
                 await asyncio.sleep(0)  # so that the session starts to connect
-                anna.post(b"", f"s{number}")
+                anna.post(b"", f"user-{turn}/s{number}")
         await asyncio.sleep(0)
         assert threading.active_count() == before
         for _ in range(32):
