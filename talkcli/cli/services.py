@@ -48,7 +48,7 @@ _UNSAFE_CHARACTERS = "[\0-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]"
 _HOME_DIRECTORIES = ("/home/", "/root/", "/run/user/")
 #: Directories to which the system-wide server can write.
 _WRITABLE_DIRECTORIES = ("/run/talk/", "/var/cache/talk/")
-#: What to do if the system-wide service can't use the path in an option, and in any other option.
+#: What to do if the system-wide service can't write to the path in an option, or read the path in any other option.
 _HIDDEN_PATH_ADVICE = dict.fromkeys(("--socket", "--player file:"), "choose a path in /run/talk")
 _HIDDEN_PATH_ADVICE["--history"] = "leave out the path, so that the history is in /var/lib/talk"
 _LET_READ = "copy it into /etc/talk, and let everybody read it"
@@ -224,11 +224,11 @@ def _find_hidden_path(flag: str, path: str, *, hides_home: bool) -> str | None:
         return "the service has a /tmp of its own (PrivateTmp=)"
     if hides_home and path.startswith(_HOME_DIRECTORIES):
         return "the unit hides home directories (ProtectHome=)"
-    if flag in ("--history", "--player file:"):
+    if flag in _HIDDEN_PATH_ADVICE:
         return None if path.startswith(_WRITABLE_DIRECTORIES) else "the service can't write there (ProtectSystem=)"
     inside = os.path.join(path, "") if os.path.isdir(path) else path
     is_readable = not os.path.exists(path) or os.stat(path).st_mode & stat.S_IROTH
-    if flag != "--socket" and not (is_readable and _find_inaccessible_file([inside]) is None):
+    if not (is_readable and _find_inaccessible_file([inside]) is None):
         return "the service's user can't read it (DynamicUser=)"
     return None
 

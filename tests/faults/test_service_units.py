@@ -230,6 +230,8 @@ def test_printing_the_system_unit_warns_if_its_user_cannot_run_talk(home: str) -
         ("--player file:/srv/x.wav", "--player file: names /srv/x.wav, but the service can't write there"),
         ("--player /var/tmp/play", "--player names /var/tmp/play, but the service has a /tmp of its own"),
         ("--socket /var/tmp/s", "choose a path in /run/talk"),
+        ("--socket /srv/s", "the service can't write there (ProtectSystem=); choose a path in /run/talk"),
+        ("--socket /run/talk/s", None),
         ("--pronounce /etc/passwd --sounds /etc --history no-text --player file:/run/talk/x.wav", None),
     ],
 )
