@@ -90,8 +90,7 @@ class SoundLibrary:
         try:
             file = self.open(name)
         except SoundError as error:
-            reason, message = error.args
-            return reason, message
+            return error.args
         if file:
             os.close(file.descriptor)
         return None
