@@ -75,7 +75,7 @@ def test_the_rest_of_a_goal_keeps_its_rate_and_the_whole_goal_is_reported(soundl
     talk = soundless
     whole = start_goal(talk, LONG)
     assert talk.watcher.wait_for_terminal(whole) == "SUCCEEDED"
-    goal = start_goal(talk, LONG)
+    goal = start_goal(talk, LONG, lead_in=900)
     aside = send(talk, HOME, interject=True)
     assert talk.request("set", rate=80)["ok"]
     assert talk.watcher.wait_for_terminal(aside) == "SUCCEEDED"
@@ -85,6 +85,10 @@ def test_the_rest_of_a_goal_keeps_its_rate_and_the_whole_goal_is_reported(soundl
     assert (found["spoken"], found["spoken_end"]) == (LONG, len(LONG))
     assert (found["duration"], found["heard"]) == (pytest.approx(expected["duration"], abs=0.2),) * 2
     assert (found["paused"], found["interrupted_by"], found["voice"]) == (False, None, expected["voice"])
+    continued_at = max(event["at"] for event in talk.watcher.events() if event.get("state") == "ACTIVE")
+    with limits():
+        first_at = min(word["at"] for word in talk.watcher.words(goal) if word["at"] > continued_at)
+        assert_within(first_at - continued_at, 0.6, "the rest, which has no lead-in")
 
 
 def test_a_pause_before_the_end_of_the_word_is_confirmed_at_its_end(soundless: Talk) -> None:
