@@ -26,7 +26,7 @@ from talkcli.errors import ServerUnavailable, TalkError, UsageError
 from talkcli.fleet import topics
 from talkcli.fleet.broker import CA, URL, USER, client_user, from_environment, is_local
 from talkcli.fleet.desk.robot import RobotConnection
-from talkcli.fleet.link import LOGIN_LIMIT_S, MAX_RECEIVE_COUNT, REASON_NOT_AUTHORIZED, Link
+from talkcli.fleet.link import LOGIN_LIMIT_S, MAX_RECEIVE_COUNT, Link, is_denied
 from talkcli.fleet.payloads import Message, Presence
 from talkcli.frozen import replace
 from talkcli.polling import run_blocking, wait_ready
@@ -53,14 +53,14 @@ _RENEWAL_LIMIT_S = 14 * 86400
 _NO_ANSWER = "no answer"
 #: Advice for each reason why the broker can't be reached.
 _UNREACHABLE_STEPS = {
-    "connection refused": "check the broker on {host}: systemctl status mosquitto; to accept connections from other "
-    "machines, its mosquitto.conf needs the line 'listener {port}'",
+    "connection refused": "check that a broker runs on {host}, for example with: systemctl status mosquitto; to accept "
+    "connections from other machines, mosquitto needs the line 'listener {port}' in its settings",
     "no such host": "correct the host in TALK_BROKER, and check it: getent hosts {host}",
     _NO_ANSWER: "check that {host} is up and that no firewall blocks it: ping {host}",
 }
 #: OpenSSL's error codes for a certificate with an invalid date or the wrong host name.
 _DATE_CODES, _HOST_CODES = (9, 10), (62, 64)
-_LOG_STEP = "read the broker's log: journalctl -u mosquitto"
+_LOG_STEP = "read the broker's log on its machine, for example with: journalctl -u mosquitto"
 
 
 class BrokerExamination:
@@ -178,7 +178,7 @@ class BrokerExamination:
         return warning(
             "anonymous",
             words,
-            "set allow_anonymous false in mosquitto.conf, and add access rules: talk bridge --print-acl",
+            "require a login (mosquitto: allow_anonymous false), and add access rules: talk bridge --print-acl",
         )
 
     def _test_rights(self, link: Link, user: str) -> tuple[Finding, dict[str, Presence]]:
@@ -218,7 +218,7 @@ class BrokerExamination:
                 is_acknowledged, end = True, min(end, now + _RETURN_LIMIT_S)
                 if not (self._is_robot or self._robot in presences):
                     link.subscribe(topics.robot(topics.ANY, topics.PRESENCE), retained=True)
-        unwritable = tuple(each for each in tested if codes.get(each) == REASON_NOT_AUTHORIZED)
+        unwritable = tuple(each for each in tested if is_denied(codes.get(each, 0)))
         missing = [each for each in tested if each not in codes]
         trouble = link.ended or (f"the broker did not acknowledge a message to {missing[0]}" if missing else None)
         unreadable = () if is_back or echo in unwritable else (echo,)
@@ -314,12 +314,12 @@ def judge_certificate(broker: Broker, expires_at: float | None, now: float) -> F
     """
     if expires_at is None:
         words = f"no TLS: anybody on the network between here and {broker.host} can read and change the messages"
-        step = f"give the broker a certificate (listener, certfile, keyfile in mosquitto.conf), and set {URL}=mqtts://…"
+        step = f"give the broker a certificate (mosquitto: listener, certfile, keyfile), and set {URL}=mqtts://…"
         return warning("certificate", words, step)
     date = time.strftime("%Y-%m-%d", time.gmtime(expires_at))
     if expires_at - now < _RENEWAL_LIMIT_S:
         words = f"valid until {date}, {format_span(expires_at - now)} from now; trusted by {_describe_cas(broker)}"
-        step = f"renew the certificate of {broker.host}, and send SIGHUP to mosquitto, so that it reads the new one"
+        step = f"renew the certificate of {broker.host}, and let the broker read it (mosquitto: send SIGHUP)"
         return warning("certificate", words, step)
     return ok("certificate", f"trusted by {_describe_cas(broker)}; valid until {date}")
 
@@ -367,13 +367,12 @@ def judge_login(broker: Broker, refusal: str | None) -> Finding:
     """
     if refusal is not None:
         wrong, _, remedy = refusal.partition("; ")
-        step = _LOG_STEP
-        if remedy:
-            step = remedy
-        elif broker.tls and broker.cert is None:  # the broker disconnects at once, so the reason may be missing
-            step += "; if it requires a certificate, set TALK_MQTT_CERT and TALK_MQTT_KEY"
-        elif not broker.tls:
-            step += f"; if port {broker.port} is for TLS, set {URL}=mqtts://{broker.host}:{broker.port}"
+        step = remedy or _LOG_STEP
+        if not remedy or "did not answer" in wrong:
+            if broker.tls and broker.cert is None:  # the broker disconnects at once, so the reason may be missing
+                step += "; if it requires a certificate, set TALK_MQTT_CERT and TALK_MQTT_KEY"
+            elif not broker.tls:
+                step += f"; if port {broker.port} is for TLS, set {URL}=mqtts://{broker.host}:{broker.port}"
         return failure("login", wrong, step)
     how = [words for words, given in (("a password", broker.password), ("a certificate", broker.cert)) if given]
     who = "an anonymous user" if broker.user is None else f"'{broker.user}'"
@@ -435,7 +434,7 @@ def judge_rights(user: str, unwritable: tuple[str, ...], unreadable: tuple[str, 
     parts += [f"read {' and '.join(unreadable)}"] if unreadable and error is None else []
     if parts:
         words = f"the broker does not allow '{user}' to {', or to '.join(parts)}"
-        return failure("rights", words, "add the missing lines to the broker's acl_file: talk bridge --print-acl")
+        return failure("rights", words, "add the missing access rules to the broker: talk bridge --print-acl")
     if error is not None:
         return failure("rights", f"the rights of '{user}' could not be tested: {error}", _LOG_STEP)
     return ok("rights", f"the broker gives '{user}' all the rights that are needed")

@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
     #: Callback that receives the reason code of a PUBACK packet.
     OnAcknowledged = Callable[[int], None]
+    #: Callback that receives a topic and the reason code for it in a SUBACK packet.
+    OnSubscribed = Callable[[str, int], None]
 
 #: MQTT keepalive interval. The broker closes a connection if it receives nothing for one and a half intervals.
 KEEPALIVE_S = 10
@@ -50,15 +52,24 @@ TICK_EVERY_S = 5.0
 MAX_PACKET_BYTES = 256 * 1024
 #: Space that is reserved in each packet for the topic and the properties.
 MAX_HEADER_BYTES = 1024
-#: Maximum number of unacknowledged QoS 1 messages. paho queues further messages. A broker announces its own limit, but
-#: paho ignores that. HiveMQ Cloud accepts 10 messages, and other brokers accept more.
+#: Maximum number of unacknowledged QoS 1 messages, unless the broker's receive maximum is lower. paho queues further
+#: messages.
 _MAX_UNACKNOWLEDGED_MESSAGES = 10
 #: The highest receive maximum that MQTT allows. A client that receives messages from all robots needs it. By default,
 #: mosquitto queues only 1,000 messages for a client, and silently drops the rest, even retained messages.
 MAX_RECEIVE_COUNT = 65_535
 # MQTT 5 reason codes. All codes from REASON_FAILURE upwards are failures.
-_REASONS_DENIED = (0x86, 0x87, 0x8A, 0x8C)
+_REASONS_LOGIN_DENIED = (0x86, 0x87, 0x8A, 0x8C)
+#: The reasons why a user may not use a topic. Some brokers, such as ejabberd, call a topic that is not allowed invalid.
+_REASONS_TOPIC_DENIED = (0x86, 0x87, 0x8A, 0x8C, 0x8F, 0x90)
 _REASON_UNSUPPORTED_PROTOCOL = 0x84
+#: What talk needs: the property of the broker's response that is 0 if this is missing, and the reason code to a login.
+_NEEDED_FEATURES = (
+    ("MaximumQoS", 0x9B, "QoS 1"),
+    ("RetainAvailable", 0x9A, "retained messages"),
+    ("WildcardSubscriptionAvailable", 0xA2, "wildcards in subscriptions"),
+)
+_SUITABLE_BROKER = "use a broker with MQTT 5, such as mosquitto 1.6 or later"
 REASON_FAILURE, REASON_NOT_AUTHORIZED = 0x80, 0x87
 #: Name of the MQTT user property that contains a robot's token.
 _TOKEN_PROPERTY = "talk-token"
@@ -72,6 +83,11 @@ def boottime() -> float:
     On Linux, this includes time spent suspended.
     """
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
+
+
+def is_denied(code: int) -> bool:
+    """Return whether a reason code says that the user may not use a topic."""
+    return code in _REASONS_TOPIC_DENIED
 
 
 class Link:
@@ -88,6 +104,7 @@ class Link:
         will: Message | None = None,
         max_packet_bytes: int = MAX_PACKET_BYTES,
         receive_maximum: int | None = None,
+        on_subscribed: OnSubscribed = lambda _topic, _code: None,
     ) -> None:
         """Create a link that isn't connected yet.
 
@@ -99,9 +116,14 @@ class Link:
             max_packet_bytes: largest packet that the broker may send.
             receive_maximum: how many unacknowledged QoS 1 messages the broker may send. If None, the broker's default
                 applies, so that a flood of messages can't stop mosquitto from delivering later ones.
+            on_subscribed: called for each topic with the broker's answer to the subscription.
         """
         self._broker = broker
-        self._deliver = on_message
+        self._deliver, self._on_subscribed = on_message, on_subscribed
+        #: the topics of each unanswered subscription, by message id
+        self._subscribing: dict[int, tuple[str, ...]] = {}
+        #: the features that talk needs and the broker doesn't have
+        self._missing_features: list[str] = []
         self._max_packet_bytes, self._receive_maximum = max_packet_bytes, receive_maximum
         #: why the connection has ended; None if it hasn't
         self.ended: str | None = None
@@ -133,6 +155,7 @@ class Link:
         self._paho.on_disconnect = self._on_disconnect
         self._paho.on_message = self._on_message
         self._paho.on_publish = self._on_publish
+        self._paho.on_subscribe = self._on_subscribe
         self._paho.on_log = self._on_log
 
     def open(self) -> None:
@@ -142,7 +165,7 @@ class Link:
             UsageError: a certificate or key file is unusable.
             ServerUnavailable: no broker answers.
             AccessDenied: the broker's certificate isn't trusted, or the broker rejects the login.
-            ProtocolMismatch: the broker doesn't speak MQTT 5.
+            ProtocolMismatch: the broker doesn't speak MQTT 5, or lacks a feature that talk needs.
         """
         url = self._broker.url
         properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
@@ -260,7 +283,9 @@ class Link:
         options = SubscribeOptions(qos=1, retainAsPublished=True, retainHandling=handling)
         with self._lock:
             if self.ended is None:
-                self._paho.subscribe([(each, options) for each in topics])
+                _, number = self._paho.subscribe([(each, options) for each in topics])
+                if number is not None:
+                    self._subscribing[number] = topics
                 self.write()
 
     def close(self) -> None:
@@ -299,16 +324,21 @@ class Link:
             why = self._alert or "it closed the connection without an answer"
             which = "the certificate of this client" if self._broker.cert else "a client without a certificate"
             words = f"the broker at {url} rejected {which}: {why}"
-            return AccessDenied(f"{words}; set TALK_MQTT_CERT and TALK_MQTT_KEY to a certificate that it accepts")
+            remedy = "set TALK_MQTT_CERT and TALK_MQTT_KEY to a certificate that it accepts"
+            return AccessDenied(f"{words}; {remedy}" if self._alert else f"{words}; {remedy}, or {_SUITABLE_BROKER}")
         if answer is None:
             why = f": {self.ended}" if self.ended else f" within {LOGIN_LIMIT_S:g} s"
-            return ServerUnavailable(f"the broker at {url} did not answer{why}")
-        if answer.value in _REASONS_DENIED:
+            words = f"the broker at {url} did not answer{why}"
+            return ServerUnavailable(f"{words}; if it doesn't support MQTT 5, {_SUITABLE_BROKER}")
+        if answer.value in _REASONS_LOGIN_DENIED:
             who = "an anonymous user" if self._broker.user is None else f"'{printable(self._broker.user)}'"
             words = f"the broker at {url} rejected the login of {who}: {answer}"
             return AccessDenied(f"{words}; set TALK_MQTT_USER and TALK_MQTT_PASSWORD_FILE for your login")
         if answer.value == _REASON_UNSUPPORTED_PROTOCOL:
-            return ProtocolMismatch(f"the broker at {url} does not support MQTT 5; use mosquitto 1.6 or newer")
+            return ProtocolMismatch(f"the broker at {url} does not support MQTT 5; {_SUITABLE_BROKER}")
+        if self._missing_features:
+            missing = " and ".join(self._missing_features)
+            return ProtocolMismatch(f"the broker at {url} does not support {missing}; {_SUITABLE_BROKER}")
         if answer.is_failure or self.ended:
             return ServerUnavailable(f"the broker at {url} refused: {answer if answer.is_failure else self.ended}")
         return None
@@ -316,16 +346,31 @@ class Link:
     def _on_connect(
         self, _client: paho.Client, _data: object, _flags: object, code: ReasonCode, properties: Properties | None
     ) -> None:
-        """Store the broker's response to the login, and its size limit."""
+        """Store the broker's response to the login, and obey its limits."""
         self._answer = code
+        self._missing_features = [
+            words for name, missing, words in _NEEDED_FEATURES if code == missing or getattr(properties, name, 1) == 0
+        ]
+        receive_maximum = getattr(properties, "ReceiveMaximum", MAX_RECEIVE_COUNT)
+        # paho ignores this limit, and its public setter refuses to change it after the login.
+        self._paho._max_inflight_messages = min(_MAX_UNACKNOWLEDGED_MESSAGES, receive_maximum)
         # Turn off paho's log, which is only needed to explain a failed login. It would use a tenth of the CPU time.
         self._paho.on_log = None
         limit = getattr(properties, "MaximumPacketSize", MAX_PACKET_BYTES)
         self.max_payload_bytes = max(0, min(MAX_PACKET_BYTES, limit) - MAX_HEADER_BYTES)
 
     def _on_disconnect(self, _client: paho.Client, _data: object, flags: object, code: ReasonCode, _: object) -> None:
-        """Record why the connection has ended."""
+        """Record why the connection has ended.
+
+        Some brokers disconnect a client that uses a topic without permission. Then, everything unanswered counts as
+        denied.
+        """
         said = getattr(flags, "is_disconnect_packet_from_server", False)
+        if said and is_denied(code.value):
+            for number in list(self._subscribing):
+                self._on_subscribe(_client, _data, number, [code] * len(self._subscribing[number]), None)
+            for number in list(self._unacknowledged):
+                self._on_publish(_client, _data, number, code, None)
         self.ended = self.ended or (f"the broker disconnected: {code}" if said else "the connection was lost")
         self._socket = None  # paho closes it
 
@@ -335,6 +380,13 @@ class Link:
         properties = [getattr(message.properties, each, None) for each in names]
         properties.append(dict(getattr(message.properties, "UserProperty", ())).get(_TOKEN_PROPERTY))
         self._deliver(Message(message.topic, bytes(message.payload), message.retain, *properties))
+
+    def _on_subscribe(
+        self, _client: paho.Client, _data: object, number: int, codes: list[ReasonCode], _: object
+    ) -> None:
+        """Pass the broker's reason code for each topic of a subscription to `on_subscribed`."""
+        for topic, code in zip(self._subscribing.pop(number, ()), codes, strict=False):
+            self._on_subscribed(topic, code.value)
 
     def _on_publish(self, _client: paho.Client, _data: object, mid: int, code: ReasonCode, _: object) -> None:
         """Forget an acknowledged message, and pass the broker's reason code to `on_acknowledged`."""

@@ -21,7 +21,7 @@ from talkcli.fleet import topics
 from talkcli.fleet.bridge.policy import ECHO_EVERY_S, STALE_CODE, Goodbye, Ignored, Policy, RemoteRequest
 from talkcli.fleet.bridge.publisher import Publisher
 from talkcli.fleet.bridge.session import RemoteSessions
-from talkcli.fleet.link import REASON_NOT_AUTHORIZED, Link, LinkOpener, boottime
+from talkcli.fleet.link import REASON_FAILURE, Link, LinkOpener, boottime, is_denied
 from talkcli.fleet.payloads import Message, Presence, bridge_rank, homeassistant_device
 from talkcli.frozen import frozen, replace
 from talkcli.protocol.events import PROTOCOL
@@ -153,6 +153,8 @@ class Bridge:
         self._retry_s = _FIRST_BROKER_RETRY_S
         #: whether this bridge has claimed the robot's name and accepts requests
         self._online = False
+        #: whether this bridge has subscribed to the robot's requests
+        self._claimed = False
         #: when the last echo was sent, by the `boottime` clock
         self._echo_at = 0.0
         #: when the presence was last published, by the event loop's clock
@@ -209,14 +211,21 @@ class Bridge:
         client_id = f"talk-{self._settings.name}-{self._session}"
         while True:
             try:
-                link = Link(self._broker, client_id, self._on_message, self._will, _MAX_INCOMING_BYTES)
+                link = Link(
+                    self._broker,
+                    client_id,
+                    self._on_message,
+                    self._will,
+                    _MAX_INCOMING_BYTES,
+                    on_subscribed=self._on_subscribed,
+                )
                 try:
                     await self._open_link(link)
                     self._on_connect(link)
                     await self._disconnected.wait()
                 finally:
                     self._disconnect(link)
-                log.write(f"disconnected from the broker: {log.sanitize(str(link.ended))}")
+                log.write_limited("disconnected", f"disconnected from the broker: {log.sanitize(str(link.ended))}")
             except TalkError as error:
                 log.write_limited("broker", log.sanitize(str(error)))
             await asyncio.sleep(random.uniform(0, self._retry_s))
@@ -242,6 +251,7 @@ class Bridge:
         """Start using a new connection. Ask whether another bridge already uses the robot's name."""
         self._disconnected.clear()
         self._link, self._descriptor = link, link.fileno()
+        self._claimed = False
         #: whether the broker has retained the presence of another bridge
         self._rival_seen = False
         #: timer that brings the robot online unless another bridge answers; None until the bridge's question returns
@@ -255,22 +265,41 @@ class Bridge:
         self._publish(Message(self._echo_topic, _RIVAL_QUESTION + self._session.encode()))
         self._send_echo()
 
-    def _go_online(self) -> None:
-        """Claim the robot's name, accept requests, and publish the robot's presence."""
-        if self._online or self._link is None:
+    def _claim_name(self) -> None:
+        """Subscribe to the robot's requests. When the broker has allowed this, the robot is online."""
+        if self._claimed or self._link is None:
             return
-        self._online, self._retry_s = True, _FIRST_BROKER_RETRY_S
+        self._claimed = True
         name = self._settings.name
         wanted = [topics.robot(name, each, topics.ANY) for each in topics.REQUEST_LEVELS]
         wanted += [topics.group(each, topics.REQUEST, topics.ANY) for each in self._presence.groups]
         if self._settings.homeassistant:
             wanted.append(topics.HOMEASSISTANT_STATUS)
         self._link.subscribe(*wanted, retained=False)
+
+    def _on_subscribed(self, topic: str, code: int) -> None:
+        """Process the broker's answer to a subscription. Go online if the robot may read its requests.
+
+        If it may not, disconnect, and try again later.
+        """
+        if code >= REASON_FAILURE:
+            words = f"the broker does not allow this robot to read {topic} (reason 0x{code:02x})"
+            log.write_limited(f"rights {topic}", f"{words}; {_RIGHTS}")
+        if topic != topics.robot(self._settings.name, topics.REQUEST, topics.ANY) or self._link is None:
+            return
+        if code >= REASON_FAILURE:
+            self._loop.call_soon(self._disconnect, self._link)
+        else:
+            self._go_online()
+
+    def _go_online(self) -> None:
+        """Accept requests, and publish the robot's presence."""
+        self._online, self._retry_s = True, _FIRST_BROKER_RETRY_S
         self._publish_presence()
         self._publish_device()
         self._publisher.schedule_status()
         self._systemd.schedule_status()
-        log.write(f"online at {self._broker.url}")
+        log.write_limited("online", f"online at {self._broker.url}")
 
     def _disconnect(self, link: Link) -> None:
         """Close a connection. If it is the current one, end all clients' sessions."""
@@ -347,7 +376,7 @@ class Bridge:
 
     def _log_if_denied(self, code: int) -> None:
         """Log an error if the broker did not allow this robot to publish a message."""
-        if code == REASON_NOT_AUTHORIZED:
+        if is_denied(code):
             log.write_limited("rights", f"the broker does not allow this robot to publish a message; {_RIGHTS}")
 
     def _max_payload(self) -> int:
@@ -403,7 +432,7 @@ class Bridge:
                     self._publish_presence()
             elif not self._rival_timer:
                 wait = _RIVAL_LIMIT_S if self._rival_seen else 0
-                self._rival_timer = self._loop.call_later(wait, self._go_online)
+                self._rival_timer = self._loop.call_later(wait, self._claim_name)
             return
         session, _, sent_at = payload.partition(b" ")
         if session == self._session.encode():
@@ -431,8 +460,9 @@ class Bridge:
             words = f"another bridge already uses the name '{self._settings.name}': session {log.sanitize(rank[1])}"
             self.end(AddressInUse(f"{words}; choose another name with --name"))
         else:
-            self._go_online()
-            self._publish_presence()  # tell the younger bridge that the name is in use
+            self._claim_name()
+            if self._online:
+                self._publish_presence()  # tell the younger bridge that the name is in use
 
     # -- what this bridge publishes about itself
 

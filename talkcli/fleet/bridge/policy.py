@@ -43,7 +43,7 @@ STALE_AFTER_S = ECHO_EVERY_S + 1.0
 #: are left to local clients.
 MAX_REMOTE_GOALS = 20
 #: How many messages of one user are processed in a second. Others are dropped, so that a flood can't delay other users.
-MAX_MESSAGES_PER_S = 100
+MAX_MESSAGES_PER_S = 500
 #: A user may have this many times as many pending goals as there are free places. So one user has at most 15 of the 20
 #: places, and the next user finds at least 5 free.
 _PENDING_PER_FREE_PLACE = 3

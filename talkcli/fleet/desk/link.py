@@ -26,6 +26,7 @@ from talkcli.fleet.link import (
     TICK_EVERY_S,
     Link,
     LinkOpener,
+    is_denied,
 )
 from talkcli.fleet.payloads import Message
 from talkcli.goals.options import Say
@@ -93,7 +94,7 @@ class DeskLink:
         self.session = os.urandom(8).hex()
         #: the current MQTT connection, or None if there is none
         self.link: Link | None = None
-        #: the error if an attempt to connect failed or the broker rejected the marker message, otherwise None
+        #: the error if an attempt to connect failed, or if the broker rejected the marker message or a subscription
         self.failure: TalkError | None = None
         #: when the marker message came back after the retained messages (monotonic time), or None until then
         self.marker_at: float | None = None
@@ -192,7 +193,7 @@ class DeskLink:
             AccessDenied: The broker rejected the login, or doesn't let this user read replies.
         """
         end = time.monotonic() + timeout
-        while not (self.retained_received or (self.marker_at is not None and is_enough())):
+        while self.failure or not (self.retained_received or (self.marker_at is not None and is_enough())):
             if self.failure is not None:
                 raise self.failure
             left = end - time.monotonic()
@@ -284,7 +285,7 @@ class DeskLink:
             action: words for the error message that say what the user isn't allowed to do.
         """
         url = self.broker.url
-        if code != REASON_NOT_AUTHORIZED:
+        if not is_denied(code):
             return ServerUnavailable(f"nothing was sent: the broker at {url} refused it (reason 0x{code:02x})")
         words = f"the broker at {url} does not allow '{self.user}' to {action}"
         return AccessDenied(f"{words}; add the lines of an operator to its access rules: talk bridge --print-acl")
@@ -315,6 +316,7 @@ class DeskLink:
                 name,
                 lambda message: self._calls.append(partial(self._receive, message)),
                 receive_maximum=MAX_RECEIVE_COUNT,
+                on_subscribed=self._on_subscribed,
             )
             self._opening = LinkOpener(new, self.wake)
         return TICK_EVERY_S if self._opening else max(0.0, self._next_attempt_at - now)
@@ -330,12 +332,18 @@ class DeskLink:
             self.handler.on_disconnected(str(opening.error))
             return
         link, self._failed_attempts, self._polled_at = opening.link, 0, time.monotonic()
+        self.failure = None
         self.link = link
         self._calls.clear()
         link.subscribe(self.reply_topic(topics.MARKER), retained=False)
         self.handler.on_connected(link)
         # The broker sends this message back after the retained messages, so it marks their end.
         link.publish(Message(self.reply_topic(topics.MARKER), b"\n"), on_acknowledged=self._on_marker_acknowledged)
+
+    def _on_subscribed(self, topic: str, code: int) -> None:
+        """Store an error if the broker has rejected a subscription."""
+        if code >= REASON_FAILURE:
+            self.failure = self._rejection_error(code, f"read {topic.replace(self.session, topics.ANY)}")
 
     def _on_marker_acknowledged(self, code: int) -> None:
         """Store an error if the broker has rejected the marker, which this link sends to itself."""
