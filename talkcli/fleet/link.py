@@ -330,8 +330,12 @@ class Link:
             why = f": {self.ended}" if self.ended else f" within {LOGIN_LIMIT_S:g} s"
             words = f"the broker at {url} did not answer{why}"
             return ServerUnavailable(f"{words}; if it doesn't support MQTT 5, {_SUITABLE_BROKER}")
+        who = "an anonymous user" if self._broker.user is None else f"'{printable(self._broker.user)}'"
+        if is_denied(answer.value) and answer.value not in _REASONS_LOGIN_DENIED:
+            # The broker rejects the topic of the will.
+            words = f"the broker at {url} does not allow {who} to publish a robot's presence: {answer}"
+            return AccessDenied(f"{words}; add the access rules of a robot: talk bridge --print-acl")
         if answer.value in _REASONS_LOGIN_DENIED:
-            who = "an anonymous user" if self._broker.user is None else f"'{printable(self._broker.user)}'"
             words = f"the broker at {url} rejected the login of {who}: {answer}"
             return AccessDenied(f"{words}; set TALK_MQTT_USER and TALK_MQTT_PASSWORD_FILE for your login")
         if answer.value == _REASON_UNSUPPORTED_PROTOCOL:

@@ -62,6 +62,7 @@ def scripted_broker(first: bytes) -> Iterator[tuple[Broker, list[socket.socket]]
         (login(0, b"\x24\x00"), ProtocolMismatch, "does not support QoS 1"),
         (login(0, b"\x25\x00\x28\x00"), ProtocolMismatch, "retained messages and wildcards in subscriptions"),
         *((login(code), AccessDenied, "rejected the login of an anonymous user") for code in (0x86, 0x87, 0x8A, 0x8C)),
+        (login(0x90), AccessDenied, "does not allow an anonymous user to publish a robot's presence"),
         (login(0x89), ServerUnavailable, "refused: Server busy"),
     ],
 )
