@@ -109,7 +109,8 @@ def test_documented_limits_of_a_fleet_match_the_code() -> None:
     requests = " ".join(FLEET.section("Requests and replies").split())
     assert f"with more than {policy.MAX_CORRELATION_BYTES} bytes of correlation data" in requests
     assert f"at most {(link.MAX_PACKET_BYTES - link.MAX_HEADER_BYTES) // 1024} KiB" in limits["a reply's payload"]
-    assert limits["pending goals of all remote clients"] == str(policy.MAX_REMOTE_GOALS)
+    of_user = policy.MAX_REMOTE_GOALS * policy._PENDING_PER_FREE_PLACE // (policy._PENDING_PER_FREE_PLACE + 1)
+    assert limits["pending goals of all remote clients; of one user"] == f"{policy.MAX_REMOTE_GOALS}; {of_user}"
     assert limits["remote clients"].startswith(
         f"{session.MAX_SESSIONS}, and {session.MAX_WAITING_REQUESTS} requests of each"
     )
