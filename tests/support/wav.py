@@ -25,7 +25,7 @@ def pitch(samples: npt.NDArray[np.int16], rate: int) -> float:
     """Return the strongest frequency in hertz."""
     padded = np.zeros(max(rate, len(samples)))
     padded[: len(samples)] = samples * np.hanning(len(samples))
-    return float(np.abs(np.fft.rfft(padded)).argmax()) * rate / len(padded)
+    return float(np.argmax(np.abs(np.fft.rfft(padded)))) * rate / len(padded)
 
 
 def wav(
