@@ -203,7 +203,7 @@ def _write_wav_file(
             return interrupts.exit_code
     if path is not None:
         result = {"output": path, "seconds": seconds, "text": text, **settings}
-        # The file has been written, even if this fails.
+        # Printing may fail, but the file has been written.
         retry_without_output(show_if_possible, show_result, options, [result], tuple)
     return EXIT_OK
 

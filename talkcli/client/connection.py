@@ -102,7 +102,7 @@ class Connection(ClientCore):
 
     #: waits until descriptors are ready, while the connection is being opened
     wait: WaitReady = staticmethod(block_until_ready)
-    #: whether the connection is opened again after a break
+    #: whether the client reconnects if the connection breaks
     reconnects = False
     #: descriptors that interrupt any wait, with their poll events
     _interrupt: Mapping[int, int] | None = None

@@ -125,7 +125,7 @@ class Pronunciations:
         # A regular expression for all terms would take seconds for a long text.
         pieces, joined, end = list(_PIECE.finditer(text, start)) if self.terms else [], list[str](), start
         for piece in pieces:
-            # A term has single blanks. In a text, it may have any blanks, except for the end of a paragraph.
+            # The words of a term may be separated by any blanks in the text, but not by the end of a paragraph.
             gap, end = text[end : piece.start()], piece.end()
             joined.append((gap and (" " if gap.count("\n") < 2 else gap)) + piece[0])
         end = start

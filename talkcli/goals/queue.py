@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     _Entry = tuple[float, int, Record]
 
 _record_of = itemgetter(2)
-#: Difference between the positions of preempting goals, interjections and other goals, more than a server has goals.
+#: Difference between the positions of preempting goals, interjections and other goals. No server has so many goals.
 _POSITIONS = 2**40
 
 

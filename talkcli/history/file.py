@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 MAX_AGE_S = 90 * 24 * 3600.0
 #: How long the clock must run without being set before goals are deleted by age. A robot may boot with a wrong time.
 STEADY_CLOCK_S = 600.0
-#: A clock that differs by more than this from the monotonic clock was set.
+#: If the time of day moves this far from the monotonic clock, somebody has set the clock.
 _CLOCK_TOLERANCE_S = 60.0
 #: Maximum size of the goals and their indexes. Together with the write-ahead log (WAL), the file has at most 64 MB.
 MAX_CONTENT_BYTES = 56_000_000

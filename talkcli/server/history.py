@@ -105,8 +105,8 @@ class History:
             self._dropped += 1
         self._schedule_write()
 
-    async def search(self, pending: PendingRequest, filters: Mapping[str, object], count: int) -> list[Row]:
-        """Return the rows of the newest goals that pass all filters, oldest first. Wait for the disk.
+    async def search(self, request: PendingRequest, filters: Mapping[str, object], count: int) -> list[Row]:
+        """Return the rows of the newest goals that pass all filters, oldest first. The request waits.
 
         Raises:
             RequestRefused: the file can't be read, or the disk doesn't respond in time.
@@ -124,7 +124,7 @@ class History:
             self._call_in_loop(partial(resume_all, waiting))
 
         self._search_thread.functions.put(search_file)
-        await pending.wait(waiting, SEARCH_LIMIT_S)
+        await request.wait(waiting, SEARCH_LIMIT_S)
         rows = answer[0] if answer else TimeoutError(f"its disk did not respond within {SEARCH_LIMIT_S:g} s")
         if isinstance(rows, Exception):
             self._damaged_file = getattr(rows, "damaged_file", None) or self._damaged_file

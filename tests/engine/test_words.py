@@ -130,18 +130,18 @@ def test_inserted_silence_delays_later_words_and_does_not_count_as_heard() -> No
     clock.start(100.0)
     clock.add(before)
     clock.add(at)
-    assert clock.heard_position(100.125) == 0.0
-    assert clock.heard_position(100.5) == 0.25
+    assert clock.heard_seconds(100.125) == 0.0
+    assert clock.heard_seconds(100.5) == 0.25
     assert clock.next_word_at() == pytest.approx(100.65)
     clock.add_silence(0.5, 1.0)
     clock.add_silence(0.5, 1.0)
     clock.add(after)
     assert clock.next_word_at() == pytest.approx(100.65)
     assert clock.pop_started(102.5) == [before]
-    assert clock.heard_position(102.5) == 0.5
+    assert clock.heard_seconds(102.5) == 0.5
     assert clock.next_word_at() == pytest.approx(102.75)
     assert clock.pop_started(102.76) == [at]
-    assert clock.heard_position(103.0) == pytest.approx(0.75)
+    assert clock.heard_seconds(103.0) == pytest.approx(0.75)
     assert clock.next_word_at() == pytest.approx(103.25)
 
 
@@ -154,12 +154,12 @@ def test_a_new_stream_starts_at_its_position_in_the_sentence() -> None:
     clock.add(missed)
     clock.add(word)
     assert clock.next_word_at() == NEVER
-    assert clock.heard_position(200.0) == 2.0
+    assert clock.heard_seconds(200.0) == 2.0
     clock.add_silence(2.0, 0.25)
     clock.start(200.0)
     assert clock.pop_started(200.0) == [missed]
     assert clock.next_word_at() == pytest.approx(200.75)
-    assert clock.heard_position(200.5) == pytest.approx(2.25)
+    assert clock.heard_seconds(200.5) == pytest.approx(2.25)
 
 
 def test_the_outputs_clock_starts_with_the_first_sound() -> None:

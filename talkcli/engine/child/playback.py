@@ -417,7 +417,7 @@ class Playback:
             return 0.0
         position = self._seconds(self._sent)
         if self._feed is not None and self._feed.player.real_time:
-            position = min(position, self._clock.heard_position(time.monotonic()))
+            position = min(position, self._clock.heard_seconds(time.monotonic()))
         return max(0.0, position - self._seconds(self._skipped))
 
     def stop(self) -> None:
@@ -658,7 +658,7 @@ class Playback:
 
     def _find_unheard_offset(self) -> int:
         """Return the offset in bytes, from the sentence's start, of the first sound that may be unheard."""
-        heard = self._clock.heard_position(time.monotonic()) - REPEATED_SOUND_S
+        heard = self._clock.heard_seconds(time.monotonic()) - REPEATED_SOUND_S
         return min(self._sent, max(self._begin, self._samples.begin, int(max(0.0, heard) * self._rate) * SAMPLE_BYTES))
 
     def _seconds(self, byte_count: int) -> float:

@@ -100,7 +100,7 @@ class WordClock:
 
     def __init__(self) -> None:
         self._waiting: deque[TimedWord] = deque()
-        #: time at which the stream started to be heard; None while the clock is stopped
+        #: time at which the first sample of the stream was heard; None while the clock is stopped
         self._started_at: float | None = None
         #: position in the audio at which the stream begins, in seconds
         self._begin = 0.0
@@ -158,8 +158,8 @@ class WordClock:
         """Return how many seconds of the stream have been heard, including silence."""
         return 0.0 if self._started_at is None else now - self._started_at
 
-    def heard_position(self, now: float) -> float:
-        """Return the position up to which the audio has been heard."""
+    def heard_seconds(self, now: float) -> float:
+        """Return how many seconds of the audio have been heard. Added silence doesn't count."""
         position = self._begin + self.elapsed(now)
         for before, seconds in self._silences:
             if position <= before:

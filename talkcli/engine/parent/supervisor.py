@@ -195,7 +195,7 @@ class Supervisor:
             post: called in the engine thread with each report, including one `Ended` for each goal.
         """
         # This class doesn't inherit from Thread, because Thread's private names differ between Python versions.
-        #: the engine thread, which starts the engine process. The owner starts this thread, and joins it after `close`.
+        #: the engine thread, which starts engine processes. The owner starts the thread, and joins it after `close`.
         self.thread = threading.Thread(target=self._run, name="engine", daemon=True)
         self._configure = configure
         self._post = post

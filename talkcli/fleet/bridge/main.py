@@ -254,7 +254,7 @@ class Bridge:
         self._claimed = False
         #: whether the broker has retained the presence of another bridge
         self._rival_seen = False
-        #: timer that brings the robot online unless another bridge answers; None until the bridge's question returns
+        #: timer that brings the robot online unless another bridge answers. None until the broker returns the question
         self._rival_timer: asyncio.TimerHandle | None = None
         self._policy.newest_echo_at = boottime()
         self._loop.add_reader(self._descriptor, self._on_ready, Link.read)

@@ -468,7 +468,7 @@ class RemoteSession:
         """Connect to the server, send queued requests, and publish lines until the connection ends."""
         shared = self._sessions
         try:
-            # A session that ends meanwhile keeps its slot until the server answers. If the server hangs, even closed
+            # If a session ends now, it keeps its slot until the server answers. If the server hangs, even closed
             # connections take up space in its backlog.
             async with shared.dialing:
                 if self._has_ended:

@@ -99,7 +99,7 @@ class FleetRequestCalls:
         self._closed = False
         #: the id of the goal that `cancel` has cancelled, or None if `cancel` hasn't been called
         self._canceled_id: str | None = None
-        #: when to check for late robots the next time (monotonic time)
+        #: monotonic time of the next check for late robots
         self._next_check = 0.0
         self._desk = DeskLink(broker, wait)
         self._desk.handler = self

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 #: page, poll reports room only after the program has read everything.
 PIPE_BYTES = 4096
 
-#: Seconds that a program has to report an error and exit after it closes its input. After that, it is killed.
+#: If a program closes its input, it may take this long to report an error and exit. After that, it is killed.
 ERROR_GRACE_S = 0.5
 
 #: Maximum seconds for which `kill` waits for the program to exit, which usually takes 1 ms. If the program hangs in the

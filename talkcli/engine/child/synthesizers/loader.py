@@ -258,7 +258,7 @@ def _fingerprints(path: str) -> _Fingerprints:
 
 
 def _load_model(voice: str) -> Iterator[tuple[Model, _Fingerprints]]:
-    """Load a voice. Yield its model and the fingerprints of its files.
+    """Load a voice for a BackgroundIterator. Yield its model and the fingerprints of its files once.
 
     Raises:
         VoiceFileError: The voice can't be loaded.
