@@ -67,9 +67,8 @@ def test_the_voice_in_use_is_loaded_and_timed(alone: dict[str, str]) -> None:
     checks = doctor({**alone, "TALK_VOICE": "piper/ti"})
     assert checks["neural"]["state"] == "ok"
     assert re.search(r"onnxruntime \d+\.\d+.*, numpy \d+\.\d+", checks["neural"]["message"])
-    assert checks["voice files"] == {
-        "check": "voice files", "state": "ok", "message": "the files of piper/tiny are complete and safe", "next": None
-    }  # fmt: skip
+    assert checks["voice files"]["state"] == "ok"
+    assert checks["voice files"]["message"] == "the files of piper/tiny are complete and safe"
     assert checks["neural voice"]["state"] == "ok"
     assert re.match(f"piper/ti {TRIED}", checks["neural voice"]["message"]), checks
     assert list(checks)[3:8] == ["voices", "neural", "voice files", "neural voice", "session"]
