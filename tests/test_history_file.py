@@ -129,7 +129,7 @@ def test_a_file_of_another_user_or_a_link_is_not_used(path: str, writer: History
     os.makedirs(os.path.dirname(path))
     (tmp_path / "other").touch()
     os.symlink(tmp_path / "other", path)
-    with pytest.raises(HistoryError, match="not a regular file of the server's user"):
+    with pytest.raises(HistoryError, match="must be a regular file that belongs"):
         writer.write([goal(1)])
     assert (tmp_path / "other").read_bytes() == b""
 

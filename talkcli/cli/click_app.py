@@ -269,7 +269,7 @@ class _CommandGroup(_HelpfulCommand, click.Group):
 
 
 @click.group(
-    help="Let a robot speak. Sentences can be awaited, cancelled and interrupted.",
+    help="Make a robot speak. You can wait for sentences, cancel them and interrupt them.",
     cls=_CommandGroup,
     invoke_without_command=True,
     subcommand_metavar="COMMAND [ARGS]...",

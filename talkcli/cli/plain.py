@@ -101,7 +101,7 @@ def _read_option(flags: Flags, word: str, rest: list[str], given: dict[str, Any]
     name, equals, text = word.partition("=")
     option, value = flags[name]
     if option.kind is OUTPUT_FILE or (equals and not (option.takes_argument and name[:2] == "--")):
-        raise ValueError(f"only click can parse the option {word}")
+        raise ValueError(f"the option {word} must be parsed by click")
     takes_argument = option.takes_argument
     if not equals and option.bare_value is not None and (not rest or rest[-1][:1] == "-"):
         takes_argument, value = False, option.bare_value

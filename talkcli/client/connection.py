@@ -153,7 +153,7 @@ class Connection(ClientCore):
 
         Raises UsageError if there is no such connection, because a broker is in between.
         """
-        raise UsageError("over a broker, a pause can't end with the program; use pause(seconds=...) instead")
+        raise UsageError("over a broker, paused() isn't possible; use pause(seconds=...) instead")
 
     async def request(self, request: Request, on_reply: OnReply | None = None) -> tuple[JsonObject, list[JsonObject]]:
         """Send a request, and wait for the answer. Return the reply and the items of its list.
@@ -332,7 +332,7 @@ class Connection(ClientCore):
         raise NotImplementedError
 
     def prepare(self, now: float) -> tuple[dict[int, int], float]:
-        """Do what is due, such as sending and reconnecting, without blocking. Return what to wait for.
+        """Send waiting requests and reconnect, if possible without blocking. Return what to wait for.
 
         Returns:
             The poll events by descriptor, and the monotonic time at which to call `process` even if nothing is ready.

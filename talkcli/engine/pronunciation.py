@@ -50,7 +50,7 @@ class SpokenText:
     """A part of a text with replaced terms.
 
     Attributes:
-        text: what is said.
+        text: the text as it is said.
         end: the offset after the part in the text that was sent. It may be greater than requested, because no term is
             cut in two.
         has_phonemes: whether `[[` and `]]` enclose phonemes.
@@ -62,7 +62,7 @@ class SpokenText:
         `replacements` has the start, the end and the replacement of each term.
         """
         self.has_phonemes = any("[[" in each for _, _, each in replacements)
-        #: for each section of the new text: where it begins there and in the text that was sent, and the length of the
+        #: for each section: its offset in the new text, its offset in the text that was sent, and the length of the
         #: term that it replaces, or 0
         self._sections: list[tuple[int, int, int]] = []
         self.text, self.end = "", start
@@ -186,7 +186,7 @@ class PronunciationFile:
             UsageError: the file can't be read.
         """
         self.path, self._report = os.path.abspath(path), report
-        #: values of which at least one changes when the file changes
+        #: the file's identity, size and times, at least one of which differs after a change
         self._stamp: tuple[int, ...] = ()
         #: why the file can't be read any more, if it can't, and messages about faulty lines, up to a limit
         self._problem, self._faults = "", list[str]()

@@ -116,7 +116,7 @@ class Speak:
     more: bool = False  # whether text will be added with `Append`
     broken: bool = False  # whether the text broke off; an incomplete sentence at its end is not spoken
     pronunciations: dict[str, str] | None = None  # terms of the text with their replacements
-    # The next fields describe what was heard before the goal was interrupted.
+    # If the goal was interrupted, the next fields describe the part that was heard.
     start: int = 0  # offset in the text at which the speech begins, or the number of samples of a sound to skip
     heard_end: int = 0  # offset of the end of the last word that was reported
     heard_words: int = 0  # number of words that were reported

@@ -473,7 +473,7 @@ OPTIONS = (
         check=_own_id_error,
         form=f"1 to {MAX_ID_CHARS} characters from `A-Z a-z 0-9 . _ : / -`",
         default_words="set by the server",
-        help="Choose the goal's id. Until the server restarts, only one sentence is spoken with this id.",
+        help="Choose the goal's id. A sentence with the same id is spoken only once until the server restarts.",
     ),
     Option(
         "rate",
@@ -569,7 +569,7 @@ OPTIONS = (
         default=STALL_S,
         limits=(MIN_STALL_S, MAX_STALL_S),
         unit=" seconds",
-        help="With --stream, stop if no text arrives for TIME. The time starts when all of the text was spoken.",
+        help="With --stream, stop if no text arrives for TIME after all earlier text was spoken.",
     ),
     Option(
         "format",

@@ -163,7 +163,7 @@ class HistoryWriter:
             os.close(os.open(self._path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o600))
         status = os.lstat(self._path)
         if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid():
-            raise OSError("it is not a regular file of the server's user")
+            raise OSError("it must be a regular file that belongs to the server's user")
         self._file = status.st_dev, status.st_ino
         self._connection = sqlite3.connect(self._path, timeout=_LOCK_WAIT_S, isolation_level=None)
         self._connection.executescript(_PRAGMAS + SCHEMA)

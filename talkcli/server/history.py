@@ -129,7 +129,9 @@ class History:
         if isinstance(rows, Exception):
             self._damaged_file = getattr(rows, "damaged_file", None) or self._damaged_file
             self._schedule_write()
-            raise RequestRefused(f"can't read the history {self._path}: {rows}; see: talk doctor", HistoryError.code)
+            raise RequestRefused(
+                f"can't read the history {self._path}: {rows}; next, run: talk doctor", HistoryError.code
+            )
         # Some goals may have been written in the meantime.
         written = {row[:2] for row in rows}
         return [*rows, *(to_row(goal) for goal in unwritten if (goal.id, goal.ended_at) not in written)][-count:]

@@ -127,7 +127,7 @@ class Server:
         self._open_history()
         if settings.pronounce:
             if not is_own_driver(settings.driver):
-                raise UsageError("--pronounce only works with talk's own driver; leave out --driver (on Linux)")
+                raise UsageError("--pronounce needs talk's own driver; on Linux, leave out --driver")
             path = settings.pronounce
             self.speech.pronunciation_file = PronunciationFile(path, lambda words: log.write(log.sanitize(words)))
         self._requests = Requests(self.speech, self._describe)
