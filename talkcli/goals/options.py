@@ -569,7 +569,7 @@ OPTIONS = (
         default=STALL_S,
         limits=(MIN_STALL_S, MAX_STALL_S),
         unit=" seconds",
-        help="With --stream, stop if no text arrives for TIME after all earlier text was spoken.",
+        help="With --stream, stop if no text arrives for TIME. The time starts after all earlier text was spoken.",
     ),
     Option(
         "format",
