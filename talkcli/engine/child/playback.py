@@ -611,12 +611,12 @@ class Playback:
             feed.lead_in -= taken
             return taken
         with self._samples.view(self._sent, min(self._sendable_end(feed), self._sent + feed.piece_bytes)) as piece:
-            silent = feed.silent_for(time.monotonic())
+            silent, was_playing = feed.silent_for(time.monotonic()), feed.player.real_time and feed.player.proven
             taken = feed.offer(piece)
         if taken and self._text_was_missing:
             self._text_was_missing = False
             feed.began_at += silent
-        elif taken and self._in_background and feed.player.real_time and silent > INAUDIBLE_GAP_S:
+        elif taken and self._in_background and was_playing and silent > INAUDIBLE_GAP_S:
             self.gaps.append(silent)
         self._sent += taken
         return taken
