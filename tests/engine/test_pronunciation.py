@@ -8,9 +8,11 @@ import pytest
 
 from talkcli.engine import protocol
 from talkcli.frozen import replace
+from talkcli.install import NEURAL_PACKAGES
 from tests.engine.process import FAST, Engine
 from tests.support import tiny_voice
 from tests.support.real_voice import REAL_VOICE, link_without_noise, real_voice
+from tests.support.surroundings import needs_packages
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -41,6 +43,8 @@ def voice(request: pytest.FixtureRequest) -> str:
 @pytest.fixture(scope="module")
 def engine(voice: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Engine]:
     """Return an engine that writes to a file. Its neural voices render a text the same each time."""
+    if voice != "espeak":
+        needs_packages(*NEURAL_PACKAGES)
     folder = tmp_path_factory.mktemp("voices")
     if voice == "joe":
         link_without_noise(real_voice(), folder)
