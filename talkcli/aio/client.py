@@ -189,7 +189,7 @@ class Client(ClientCalls):
         while True:
             yield await next_event()
 
-    if not TYPE_CHECKING:  # type checkers would accept any name
+    if not TYPE_CHECKING:  # type checkers would otherwise accept any name
 
         def __getattr__(self, name: str) -> Any:
             """Explain that a client is not connected, if its connection is missing."""

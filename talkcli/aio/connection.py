@@ -84,11 +84,11 @@ class LoopConnection(Connection):
     """
 
     wait = staticmethod(wait_ready)
-    #: what the loop waits for, or None before and after the connection is open
+    #: the events that the loop waits for, or None while the connection isn't open
     _watch: Watch | None = None
     #: the earliest time limit of the connection and all waiting coroutines (monotonic time)
     _limit = NEVER
-    #: by the future of each coroutine in `until`: its condition, its deadline, and when it started to wait
+    #: the condition, the deadline and the start time of each coroutine that waits in `until`, by its future
     _waits: dict[asyncio.Future[bool], tuple[Callable[[], bool], float, float]]
 
     @classmethod

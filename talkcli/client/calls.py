@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 
 #: Number of bytes in a request that are reserved for everything except the list of ids.
 _RESERVED_LINE_BYTES = 4096
-#: The maximum size of an ASCII character, such as an escaped quote, and of any other character in JSON.
+#: The maximum size in JSON of an ASCII character, such as an escaped quote, and of any other character.
 _MAX_ASCII_BYTES, _MAX_CHARACTER_BYTES = 2, 12
-#: A `seq` that has more digits than any real one.
+#: A `seq` with more digits than any real one has.
 _LONG_SEQ = 10**15
 
 
@@ -70,7 +70,7 @@ class ClientCalls(ConnectedClient):
     def __init__(self, connection: Connection) -> None:
         """Use a connection that has received the server's greeting."""
         self._connection = connection
-        #: the first server's boot id, which is prepended to ids that are only numbers
+        #: the first server's boot id, which is prepended to ids that consist only of a number
         self._first_boot = connection.boot
 
     async def cancel(
@@ -123,7 +123,7 @@ class ClientCalls(ConnectedClient):
     ) -> list[Goal]:
         """Return the most recently ended goals, including REJECTED ones, oldest first."""
         request = Log(count, since, until, state.name if state else None, name, key, grep)
-        # Older servers have no history, and know no filters.
+        # Older servers have no history and don't support filters.
         known = "history" in (self._connection.server.features or ())
         request = replace(request, history=history and (known or request != Log(count)))
         return list(goals((await self._ask(request))[1], "goal"))
@@ -375,7 +375,7 @@ def too_long(request: Say) -> Goal | None:
         raise UsageError(f"'data' can't be sent as JSON: {error}") from None
     if len(line) <= MAX_LINE_BYTES:
         return None
-    from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
+    from talkcli.goals.reasons import Reason  # this import is slow and rarely needed
 
     message = f"not spoken: the text is too long for a request ({len(request.text):,} characters)"
     return Goal("", State.REJECTED, request.text, reason=Reason.TEXT_TOO_LONG.value, message=message)

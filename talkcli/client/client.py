@@ -239,7 +239,7 @@ class Client(ConnectedClient):
         """
         given = {name: value for name, value in locals().items() if name != "self"}
         say = self._calls._stream_request(**given)
-        from talkcli.client.stream import SpeechStream  # rarely needed, and slow to import
+        from talkcli.client.stream import SpeechStream  # this import is slow and rarely needed
 
         return SpeechStream(self._connection, say)
 

@@ -11,7 +11,7 @@ explains what is wrong. A request that could have an effect is never sent twice.
 
 from __future__ import annotations
 
-import _socket  # importing `socket` takes longer (see `peers`)
+import _socket  # importing `socket` would take longer (see `peers`)
 import os
 import time
 
@@ -33,7 +33,7 @@ GREETING_START = b'{"talk": 1, "version": '
 GREETING_WAIT_S = 0.2
 #: Maximum waiting time of `yield_processor`.
 _LONGEST_YIELD_S = 0.2
-#: If an answer contains one of these, the goal will not be spoken.
+#: If an answer contains one of these texts, the goal will not be spoken.
 _REFUSALS = (b'"ok": false', b'"state": "REJECTED"')
 #: Time limit for a greeting, for each answer, and for attempts to reach a busy server.
 ANSWER_LIMIT_S = 5.0
@@ -247,7 +247,7 @@ async def connect(
         left = give_up - time.monotonic()
         if not again or attempt.request_sent or left <= 0:
             raise error or unreachable_error(attempt, named_path)
-        import random  # rarely needed, and slow to import
+        import random  # this import is slow and rarely needed
 
         await wait({}, min(random.uniform(*RETRY_PAUSE_S), left), interrupt)
         attempt = reach(named_path)
@@ -307,8 +307,8 @@ def unreachable_error(attempt: ConnectionAttempt, named_path: str | None) -> Tal
         path = attempt.failures[-1][0]
         return ServerUnavailable(f"the server at {path} doesn't accept connections; restart it if it hangs")
     tried = ""
-    found = ""  # description of the last place
-    advice = ""  # how to get access to the last place that refused this user
+    found = ""  # what was found at the last path
+    advice = ""  # how to get access to the last path that refused this user
     for path, error in attempt.failures:
         words = str(error)
         if isinstance(error, OSError):
@@ -341,7 +341,7 @@ def _advice_for_named_socket(named_path: str, found: str, access_advice: str) ->
         found: what is there, as described by `paths.connect_failure`.
         access_advice: how to get access, or an empty text if this user isn't refused.
     """
-    import shlex  # rarely needed, and slow to import
+    import shlex  # this import is slow and rarely needed
 
     from talkcli.terminal.text import printable
 

@@ -10,7 +10,7 @@ import os
 import select
 import threading
 import time
-from _socket import SHUT_RDWR  # importing `socket` takes longer (see `peers`)
+from _socket import SHUT_RDWR  # importing `socket` would take longer (see `peers`)
 
 from talkcli import paths, peers
 from talkcli.client.connect import ANSWER_LIMIT_S, connect, hello, reach, sender_name, unreachable_error
@@ -100,7 +100,7 @@ class Connection(ClientCore):
     ServerUnavailable. Events that were received before can still be read.
     """
 
-    #: waits until descriptors are ready, while the connection is being opened
+    #: the function that waits for descriptors while the connection is being opened
     wait: WaitReady = staticmethod(block_until_ready)
     #: whether the client reconnects if the connection breaks
     reconnects = False
@@ -117,7 +117,7 @@ class Connection(ClientCore):
         The server must answer each request within `patience_s` seconds.
         """
         super().__init__(patience_s, time.monotonic())
-        #: protects all state, and is notified after messages have been processed
+        #: a condition that protects all state. It is notified after messages have been processed.
         self.changed = threading.Condition()
         self._process = os.getpid()
         self._reading = False

@@ -15,7 +15,7 @@ as arguments. The caller must make sure that only one thread at a time calls a m
 from __future__ import annotations
 
 import itertools
-from _weakrefset import WeakSet  # importing `weakref` takes longer
+from _weakrefset import WeakSet  # importing `weakref` would take longer
 from collections import deque
 from collections.abc import Callable
 
@@ -235,7 +235,7 @@ class TrackedGoal:
 
     def _fail(self, error: TalkError) -> None:
         """End the goal as LOST or REJECTED after a failed `say` request."""
-        from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
+        from talkcli.goals.reasons import Reason  # this import is slow and rarely needed
 
         if isinstance(error, Lost):
             self._mark_lost(error.message)
@@ -246,7 +246,7 @@ class TrackedGoal:
 
     def _mark_lost(self, why: str) -> None:
         """End the goal as LOST, unless it has already ended."""
-        from talkcli.goals.reasons import Reason  # rarely needed, and slow to import
+        from talkcli.goals.reasons import Reason  # this import is slow and rarely needed
 
         self._update(replace(self.goal, state=State.LOST, reason=Reason.LOST.value, message=f"result unknown: {why}"))
 
@@ -266,8 +266,8 @@ class TrackedGoal:
                 self._buffer.add(StateChanged(event.id, event.state))
             self.goal = event
         elif isinstance(event, StateChanged):
-            # A terminal state is followed by the Result, which has more details. If the goal was interrupted, it
-            # continues or is being stopped.
+            # A terminal state is followed by the Result, which has more details. Any other change of state ends an
+            # interruption.
             if not event.state.terminal:
                 paused = self.goal.paused and self.goal.interrupted_by is None
                 self.goal = replace(self.goal, state=event.state, paused=paused, interrupted_by=None)
@@ -328,7 +328,7 @@ def read_greeting(line: bytes, path: str) -> ServerInfo:
         raise ServerUnavailable(f"the program listening at {path} is not a talk server")
     events.check_greeting(greeting)
     if "error" in greeting:
-        from talkcli.terminal.text import printable  # rarely needed, and slow to import
+        from talkcli.terminal.text import printable  # this import is slow and rarely needed
 
         reason = printable(str(greeting.get("message") or greeting["error"]))
         raise AccessDenied(f"the server refused the connection: {reason}")
@@ -417,7 +417,7 @@ class ClientCore:
         self._hello = b""
         #: the bytes of the first request that were sent before this object was created
         self._sent_early = b""
-        #: why requests can no longer be sent, or None if they can. Answers may still be received.
+        #: why requests can no longer be sent, or None. Answers may still be received.
         self._sending_ended: str | None = None
         #: the last error message that did not belong to a request. It explains why the server closes the connection.
         self._last_error: str | None = None
@@ -543,7 +543,7 @@ class ClientCore:
         missing = missing_features(request_to_json(request), features) if features is not None else []
         if not missing:
             return None
-        from talkcli.terminal.text import printable  # rarely needed, and slow to import
+        from talkcli.terminal.text import printable  # this import is slow and rarely needed
 
         version, name = printable(self.server.version), FEATURES[missing[0]][0]
         return ProtocolMismatch(f"the server (version {version}) does not support {name}; restart it")
@@ -553,7 +553,7 @@ class ClientCore:
 
         `items` are the list items before the reply.
         """
-        from talkcli.terminal.text import printable  # rarely needed, and slow to import
+        from talkcli.terminal.text import printable  # this import is slow and rarely needed
 
         error = reply.get("error")
         code, message = (error.get("code"), error.get("message")) if isinstance(error, dict) else (None, None)
@@ -643,7 +643,7 @@ class ClientCore:
                 continue
             try:
                 self.dispatch(decode(line), now)
-            except (BadRequest, ValueError) as error:  # ValueError: a malformed goal or event
+            except (BadRequest, ValueError) as error:  # a ValueError reports a malformed goal or event
                 self.break_off(f"the server sent a malformed message: {error}", now)
 
     def match(self, message: JsonObject) -> Exchange | None:
@@ -687,7 +687,7 @@ class ClientCore:
             if exchange.on_reply:
                 exchange.on_reply(reply, exchange.items)
         except Unreadable as error:
-            # If the request may have taken effect, it fails when this error breaks the connection.
+            # A request that may have taken effect fails later, when this error breaks the connection.
             if not isinstance(exchange.request, self.lasting):
                 self.fail(exchange, error)
             raise
@@ -786,7 +786,7 @@ class ClientCore:
                     self.listeners.update(goal)
 
         def on_failure(error: TalkError) -> None:
-            if self.absent_since is None:  # after another break, the next connection follows the goal
+            if self.absent_since is None:  # if the connection has broken again, the next one will follow the goal
                 self.listeners.lose(goal_id, f"{error.message}; the sentence may have been spoken")
 
         self._queue_exchange(Exchange(Wait((goal_id,), feedback), on_reply, on_failure), now)

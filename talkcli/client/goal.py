@@ -271,7 +271,7 @@ class _EventStream:
         for handle in self.unfinished:
             event: Event | None = None
             while not isinstance(event, Result) and (event := handle._take()):
-                # A Result has no number, and is sorted by the number of its goal's last event. It stays behind this
+                # A Result has no number, and is sorted by the number of its goal's last event. It stays after this
                 # event, because sorting is stable.
                 number = getattr(event, "n", None) or self._last_numbers.get(handle.id, 0)
                 self._last_numbers[handle.id] = number

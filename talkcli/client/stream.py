@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from talkcli.client.connection import Connection
     from talkcli.goals.goal import JsonObject
 
-#: How many times an addition to a text is sent again. The limit matters if the request itself breaks the connection.
+#: How many times an addition to a text is sent again. Without this limit, a request that breaks the connection would be
+#: repeated endlessly.
 _MAX_RESENDS = 5
 
 

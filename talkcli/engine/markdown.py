@@ -23,7 +23,7 @@ _MAX_SPAN_CHARS = 500
 _SENTENCE_PAUSE, _CELL_PAUSE = "。", "，"
 #: Characters after which no further pause is needed.
 _PUNCTUATION = ".,;:!?…。，；：！？"
-#: Letters from here on belong to scripts without blanks between words.
+#: This character and all later ones belong to scripts without blanks between words.
 _FIRST_UNSPACED = "\u2e80"
 
 _TAG_NAMES = (
@@ -79,7 +79,7 @@ _PARTIAL_LINK = re.compile(
     r"""[ \t\n]{0,9})?)?\Z""",
     re.DOTALL,
 )
-#: For each mark of emphasis, its end.
+#: Patterns that match the closing mark of emphasis, by opening mark.
 _EMPHASIS = {
     "*": re.compile(r"(?P<end>\*)(?<![\s*\\]\*)(?![*a-zA-Z0-9\u00c0-\u024f])"),
     "_": re.compile(r"(?P<end>_)(?<![\s_\\]_)(?!\w)"),
@@ -108,11 +108,11 @@ class MarkdownReader:
         self._in_table = False
         #: whether the current paragraph began as an item of a list
         self._in_list = False
-        #: whether "**" or a similar mark is open, so that it may be closed within a word
+        #: whether "**" or a similar mark is open, which may be closed within a word
         self._is_strong = False
-        #: closing marks of spans that have begun: their lengths by offset
+        #: lengths of the closing marks of open spans, by offset
         self._closing: dict[int, int] = {}
-        #: the last character of the paragraph that was returned and isn't blank
+        #: the last non-blank character returned from the current paragraph
         self._last = ""
 
     def read(self, text: str, *, ended: bool = False) -> str:
@@ -167,7 +167,7 @@ class MarkdownReader:
         assert match
         kind, number, marks = str(match.lastgroup), match["number"], " " * len(match.group())
         if number and number != "1" and before == "paragraph" and not self._in_list:
-            kind, marks = "paragraph", ""  # the number belongs to a sentence that began on an earlier line
+            kind, marks = "paragraph", ""  # the number is part of a sentence that began on an earlier line
         elif number:
             place = match.start("number") - at
             marks = marks[:place] + number + _CELL_PAUSE + marks[place + len(number) + 1 :]
@@ -194,7 +194,7 @@ class MarkdownReader:
         marks = line.strip(" \t>")
         if text[at - 1] == "\n" and not marks.strip(self._fence[0]):
             if end < 0 and not self._ended:
-                return None  # more text decides whether the code block ends
+                return None  # only more text can show whether the code block ends
             if len(marks) >= len(self._fence):
                 self._fence = ""
                 return " " * len(line)

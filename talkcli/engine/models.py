@@ -30,7 +30,7 @@ PACKAGE_VARIABLES = {
     # Since version 1.30, onnxruntime writes a device id into ~/.cache/Microsoft when it is imported, and contacts a
     # server some seconds later. A robot must never do this.
     "ORT_DISABLE_TELEMETRY": "1",
-    # Importing numpy would start threads, which takes longer than the import itself. Voices don't need them.
+    # Importing numpy would start threads, which takes longer than the import itself. Voices don't need these threads.
     "OPENBLAS_NUM_THREADS": "1",
 }
 
@@ -257,7 +257,7 @@ def _writable_error(*paths: str) -> VoiceFileError:
 
     It includes a command that fixes all of them.
     """
-    import shlex  # imported here because it is rarely needed
+    import shlex  # this import is rarely needed
 
     names = f"{', '.join(paths[:-1])} and {paths[-1]}" if len(paths) > 1 else paths[0]
     needs_root = os.geteuid() != 0 and any(os.stat(each).st_uid == 0 for each in paths)

@@ -31,8 +31,8 @@ PIECE_S = 0.02
 #: player stalls. A buffer of less than three periods of 20 ms would cause gaps on a busy machine.
 BUFFER_MS = 60
 
-#: Bytes that a program may read before it opens its device (one block of standard input). If it reads more, it must be
-#: playing.
+#: Bytes that a program may read before it opens its device (one block of standard input). A program that has read more
+#: must be playing.
 READ_AHEAD_BYTES = 4096
 
 #: The prefix of a player that writes to a file, as in "file:PATH".
@@ -93,7 +93,7 @@ def _pacat_command(rate: int, device: str | None) -> PlayerCommand:
     argv = ["pacat", "--playback", "--raw", "--format=s16le", "--channels=1", f"--rate={rate}"]
     argv += [f"--latency-msec={BUFFER_MS}", "--process-time-msec=20", "--client-name=talk", "--stream-name=talk"]
     argv += ["-d", device] if device else []
-    # While pacat is still connecting, it reads once and gets at most one piece.
+    # While pacat is still connecting, it reads once and gets at most one piece of samples.
     return PlayerCommand("pacat", tuple(argv), read_ahead=int(PIECE_S * rate) * SAMPLE_BYTES)
 
 

@@ -105,7 +105,7 @@ class Pronunciations:
 
     def __init__(self, terms: dict[str, str]) -> None:
         self.terms = terms
-        #: for each first piece of a term, in lower case: the numbers of pieces that such terms have
+        #: the possible numbers of pieces in a term, by the term's first piece in lower case
         self._lengths = defaultdict[str, set[int]](set)
         for pieces in map(_PIECE.findall, terms):
             self._lengths[pieces[0].lower()].add(len(pieces))
@@ -114,7 +114,7 @@ class Pronunciations:
         """Return a text, or its part from `start` to `end`, with all terms replaced."""
         end, replacements, added = len(text) if end is None else end, [], 0
         for first, last, replacement in self._find(text, start):
-            if first >= end or added > MAX_TEXT_CHARS:  # after that, terms are spoken as they are
+            if first >= end or added > MAX_TEXT_CHARS:  # later terms are spoken unchanged
                 break
             added += len(replacement)
             replacements.append((first, last, replacement))
@@ -143,7 +143,7 @@ class Pronunciations:
     def say(self, text: str, text_format: str) -> str | None:
         """Return a goal's text as it is said, for people to read. Return None if it is said as it was sent."""
         if text_format == MARKDOWN:
-            from talkcli.engine.markdown import blank_markdown  # rarely needed, and slow to import
+            from talkcli.engine.markdown import blank_markdown  # this import is slow and rarely needed
 
             said = " ".join(self.apply(blank_markdown(text)).text.split())
         else:
@@ -188,7 +188,7 @@ class PronunciationFile:
         self.path, self._report = os.path.abspath(path), report
         #: the file's identity, size and times, at least one of which differs after a change
         self._stamp: tuple[int, ...] = ()
-        #: why the file can't be read any more, if it can't, and messages about faulty lines, up to a limit
+        #: the reason why the file can't be read any more, or "", and a limited number of messages about faulty lines
         self._problem, self._faults = "", list[str]()
         self._table = Pronunciations({})
         self.refresh()

@@ -333,7 +333,7 @@ class VoiceChosen:
 
     id: str
     voice: str  # voice ID
-    fallback_reason: str | None = None  # human-readable reason for a fallback voice; None for the requested voice
+    fallback_reason: str | None = None  # human-readable reason for a fallback voice; None if the requested voice speaks
 
 
 @frozen
@@ -360,7 +360,7 @@ class Ended:
     rest: int | None = None  # the `start` of the `Speak` that continues the goal; None unless it was interrupted
 
 
-#: Commands that start a goal. There is one for each kind of goal.
+#: The command that starts a goal.
 GoalCommand = Speak
 #: Commands for the current goal, which they name by its `id`.
 ActiveGoalCommand = Append | Stop | Interrupt | Hold | Continue | NextGoal

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 MAX_DECODED_BYTES = 64_000_000
 #: Maximum number of chunks in a file before its samples. Usual files have fewer than ten.
 _MAX_CHUNKS = 64
-#: Maximum number of characters of a name in an error message, and maximum number of names.
+#: Maximum length of a name in an error message, and maximum number of names in the message.
 _SHOWN_NAME_CHARS, _SHOWN_NAMES = 60, 10
 
 #: The built-in sounds as tones. A tone has a frequency in Hz at its start and at its end, and a length in seconds.
@@ -39,11 +39,11 @@ BUILT_IN: dict[str, tuple[tuple[float, float, float], ...]] = {
 _PCM, _FLOAT, _EXTENSIBLE = 1, 3, 0xFFFE
 #: The end of the GUID that follows the format's number in an extensible header.
 _GUID_END = bytes.fromhex("000000001000800000aa00389b71")
-#: The length in the header of a WAV stream, whose length was unknown when it was written.
+#: The length field of a WAV stream whose length was unknown when its header was written.
 _UNKNOWN_BYTES = 0xFFFFFFFF
-#: Names of formats in WAV files, by their number.
+#: Names of WAV formats, by format number.
 _WAV_FORMATS = {_PCM: "integer", 2: "ADPCM", _FLOAT: "floating-point", 6: "A-law", 7: "µ-law", 17: "ADPCM", 85: "MP3"}
-#: How other files begin, perhaps after their length in 4 bytes.
+#: The first bytes of other kinds of files. A length of 4 bytes may come before these bytes.
 _OTHER_FILES = {
     "MP3": (b"ID3", b"\xff\xfb", b"\xff\xf3", b"\xff\xf2"),
     "AAC": (b"\xff\xf1", b"\xff\xf9"),

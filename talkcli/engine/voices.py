@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 VARIANT_PREFIX = "+"
 _DEFAULT_LANGUAGE = "en"
 
-#: The maximum number of suggestions for an unknown name, and how similar they must be to it (0 to 1). At this value,
-#: "Dutch" is not suggested for "nosuch".
+#: The maximum number of suggestions for an unknown name, and their minimum similarity to the name (0 to 1). With this
+#: minimum, "Dutch" is not suggested for "nosuch".
 _MAX_SUGGESTIONS, _MIN_SIMILARITY = 3, 0.7
 #: Matches a language code with a region, such as "de-at" or "es-419".
 _WITH_REGION = re.compile(r"([a-z]{2,3})-(?:[a-z]{2}|[0-9]{3})")

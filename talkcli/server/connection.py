@@ -216,9 +216,9 @@ class ClientConnection(asyncio.Protocol):
         self._loop = streams.loop
         self._splitter = LineSplitter(MAX_LINE_BYTES - 1)
         self._lines: deque[bytes] = deque()
-        #: lists that are being sent, and lines that follow them
+        #: lists that are being sent, and the lines that follow them
         self._outbox: deque[Iterator[JsonObject] | bytes] = deque()
-        #: latest feedback, held back because the client reads too slowly
+        #: the latest feedback, which is held back because the client reads too slowly
         self._held_feedback = b""
         self._half_closed = self._finishing = self._work_is_scheduled = False
         self._bad_lines = 0

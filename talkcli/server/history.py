@@ -35,13 +35,14 @@ if TYPE_CHECKING:
 WRITE_AFTER_S = 1.0
 #: How long to wait after a failed attempt to write.
 RETRY_AFTER_S = 10.0
-#: Maximum number of goals to write at once, which are then not more than 7 MB. If so many wait, they are written soon.
+#: Maximum number of goals to write at once, which have at most 7 MB. If this many goals are waiting, they are written
+#: soon.
 BATCH_GOALS = 32
-#: Maximum number of goals that wait to be written. The scheduler keeps the texts of as many goals.
+#: Maximum number of goals that wait to be written. The scheduler keeps the texts of the same number of goals.
 MAX_UNWRITTEN_GOALS = 2_200
 #: How long a search may take. Clients give up after five seconds.
 SEARCH_LIMIT_S = 4.0
-#: How long a server that shuts down waits until its last goals are written.
+#: How long a server that is shutting down waits for its last goals to be written.
 _CLOSE_LIMIT_S = 1.0
 
 
@@ -83,7 +84,7 @@ class History:
         self._write_thread, self._search_thread = _Worker("history-write"), _Worker("history-search")
         #: goals that are not known to be written, oldest first
         self._unwritten: deque[Goal] = deque()
-        #: how many of these goals, from the oldest on, are being written. None if the thread is idle.
+        #: how many of the oldest unwritten goals are being written, or None if the thread is idle
         self._writing: int | None = None
         self._timer: asyncio.TimerHandle | None = None
         #: a file that a search has found to be damaged, or None

@@ -213,7 +213,7 @@ def _refuse_second_server(path: str | None) -> None:
     try:
         found = run_blocking(connect(path, hello(None, urgent=True)))
     except (ServerUnavailable, AccessDenied):
-        return  # no server answers clients of this user
+        return  # this user can't reach any server
     except TalkError as error:
         raise AddressInUse(f"a server is already running: {error}") from error
     assert found.socket

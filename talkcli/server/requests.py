@@ -181,7 +181,7 @@ class Requests:
         for each in list(self._speech.waiting_for_room):
             say = each.request
             assert isinstance(say, Say)
-            # If there is no room for a goal without an id, there is none for others with the same values.
+            # If there is no room for a goal without an id, there is also none for other goals with the same values.
             kind = (say.priority, say.key, say.flush, say.preempt) if say.id is None else None
             if kind in without_room:
                 continue
@@ -329,7 +329,7 @@ class Requests:
             if not record.state.terminal:
                 self._speech.subscribers.subscribe_to_goal(record.id, pending.connection, feedback=request.feedback)
         # The list shows the goals as they are now, and events report later changes. Only goals that have begun may look
-        # different later, so their snapshots are made now. The other snapshots are made when they are sent.
+        # different later, so snapshots of these goals are made now. The other snapshots are made when they are sent.
         begun = {each: each.snapshot() for each in self._scheduler.begun()}
         states = [(record, record.state) for record in records]
         goals = (begun.get(record) or record.snapshot(state) for record, state in states)

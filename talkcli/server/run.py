@@ -141,7 +141,7 @@ class Server:
         #: the error that ended the server, if any
         self._fatal_error: TalkError | None = None
         self._started_at = time.time(), time.monotonic()
-        #: last logged reason why clients can't connect, or empty if they can
+        #: the last logged reason why clients can't connect, or an empty string if they can
         self._unreachable_reason = ""
         # A shell without job control starts background processes with SIGINT ignored. In this case, keep ignoring it.
         ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN

@@ -205,7 +205,7 @@ class Speech:
         self.on_status_change()
         if resumed:
             self.silent_goal = None
-            resume_all(self.waiting_for_silence[resumed])  # requests that wait for silence can be answered now
+            resume_all(self.waiting_for_silence[resumed])  # requests that wait for silence can now be answered
 
     def _carry_out(self, effect: EngineOrder | VoiceLoadOrder | VoiceDropOrder | VoiceWarning) -> None:
         """Give the engine an order, or log a warning about a voice."""
@@ -387,7 +387,7 @@ class Speech:
         """Process one report from the engine."""
         now, active = self.advance_time(), self.scheduler.active
         if isinstance(report, protocol.GoalEvent):
-            if active and active.id == report.id:  # ignore reports about a goal that is no longer active
+            if active and active.id == report.id:  # reports about a goal that is no longer active are ignored
                 self._process_goal_event(report, active, now)
         elif isinstance(report, protocol.VoiceEvent):
             self._process_voice_event(report, now)
@@ -467,7 +467,7 @@ class Speech:
     def _end_active_goal(self, ended: protocol.Ended, active: Record, now: Now) -> None:
         """End the active goal after the engine has reported its end."""
         scheduler = self.scheduler
-        if self.ready and ended.player:  # let `status` show the player that was used
+        if self.ready and ended.player:  # `status` shows the player that was used
             self.ready = replace(self.ready, player=ended.player)
         if ended.heard is not None:
             scheduler.audio_heard(ended.id, ended.heard)

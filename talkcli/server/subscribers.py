@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 #: Interval between keep-alive messages. Clients consider a server dead if three of them are missing.
 CLIENT_ALIVE_INTERVAL_S = 5.0
 
-#: Maximum number of notifications in one iteration of the event loop. They take three milliseconds.
+#: Maximum number of notifications to process in one iteration of the event loop. They take three milliseconds.
 _MAX_CALLS_PER_TURN = 64
 #: If one iteration adds more unread output than this, the server waits for clients to read.
 _UNREAD_LIMIT_BYTES = 1024 * 1024

@@ -71,7 +71,7 @@ class VoiceCatalog:
         if not (is_neural(voice) or is_neural(settings_voice or "")):
             found = find_voice(voice, self._driver_voices)
             if found is not None:
-                return found  # no need to read the directories of neural voices
+                return found  # the directories of neural voices don't have to be read
         return find_voice(voice, self._candidates(voice), settings_voice)
 
     @property

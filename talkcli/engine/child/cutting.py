@@ -18,11 +18,11 @@ _QUIET_S = 0.1
 _LONG_QUIET_S = 1.0
 #: If the player has less sound left than this, a clause is spoken before the rest of its sentence has arrived.
 _LOW_BUFFER_S = 0.15
-#: Minimum length of a clause, and maximum length of a part while the text grows.
+#: Minimum length of a clause, and maximum length of a part of a growing text.
 _CLAUSE_CHARS, _PART_CHARS = 12, 300
-#: How many characters before a dot to search for an abbreviation.
+#: How many characters before a dot are searched for an abbreviation.
 _ABBREVIATION_CHARS = 24
-#: How long to wait for more text before a sentence may end at a mark. `_NEVER` means that it can't end there.
+#: How long to wait for more text before a sentence may end at a mark. `_NEVER` means that the sentence can't end there.
 _NO_WAIT, _SHORT_WAIT, _LONG_WAIT, _NEVER = range(4)
 
 _CLOSERS = r"[\"'”’“‘»«›‹)\]}*_~`」』）】》]*"
@@ -46,10 +46,9 @@ _LAST_WORD = re.compile(r"[^\W\d_]*['’]?\Z")
 #: Characters that may come between the end of a sentence and the first letter of the next one.
 _LEAD = ' \t\r\n\u00a0\u202f\u3000"“„‘‚«»‹›([{*_~—–¿¡-'
 
-#: An abbreviation or a number with a dot. The name of the group says whether the sentence can end at the dot. With
-#: "never", it can't. With "numbered", it can't end before a number. With "often", it can, except before a weekday or a
-#: time zone. With "maybe", it can end only before a word that begins sentences. With "number", it can't end before a
-#: month.
+#: Matches an abbreviation, or a number with a dot. In the group "never", the dot never ends a sentence. In the other
+#: groups, the dot may end a sentence unless a number ("numbered"), a weekday or time zone ("often") or a month
+#: ("number") follows, or only if a word that begins sentences follows ("maybe").
 _ABBREVIATION = re.compile(
     r"""(?:
     (?P<never>(?:\A|\n)[\s>*_\#-]*\(?\d{1,3}|:\s1|(?<![\w.])(?:
@@ -81,7 +80,7 @@ _STARTER = r"""(?:
     |There|These|They|This|Those|To|Today|Tomorrow|Tous|Tout|Trotzdem|Tu|Tú|Um|Una?|Und|Une|Unsere?|Unter|Usted|Über
     |Voici|Von|Vor|Votre|Vous|War|Warum|Was|We|Wenn|Were|What|When|Where|Which|While|Who|Why|Wie|Will|Wir|With|Wo
     |Would|Y|Yes|Yo|You|Your|Zu|Zum)(?![\w.])|(?:L|J|C|N|Qu|Aujourd)['’]"""
-#: Matches the text after an abbreviation or a number if the sentence goes on there.
+#: Matches the text after an abbreviation or a number if the sentence continues.
 _REST = {
     "numbered": re.compile(r"\d"),
     "often": re.compile(r"(?:Mon|Tues|Wednes|Thurs|Fri|Satur|Sun)day|(?:East|West)ern|Pacific|[ECMP][SD]?T\b|GMT|UTC"),
@@ -107,9 +106,9 @@ class GrowingText:
         self.ended = ended
         #: offset up to which the synthesizer has received the text
         self.position = start
-        #: offset up to which the text after the position was searched without finding the end of a sentence
+        #: offset up to which the text was searched without finding the end of a sentence
         self._searched = 0
-        #: time of the last change; None until it is known
+        #: time of the last change to the text; None until the first search for a part
         self._changed_at: float | None = None
 
     @property

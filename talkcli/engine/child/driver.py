@@ -124,7 +124,7 @@ def _start_engine(pyttsx3: Any, name: str, *, user_chosen: bool) -> Any:
         raise CannotStart(_start_error_message(name, error), permanent=False) from error
     try:
         engine.startLoop(False)
-        engine.iterate()  # otherwise, a faulty driver would hang at the first goal
+        engine.iterate()  # without this call, a faulty driver would hang at the first goal
     except TypeError as error:
         message = f'the driver "{name}" cannot be used (its iterate() is not a generator); leave out --driver'
         raise CannotStart(message, usage_error=True) from error

@@ -31,7 +31,7 @@ def main() -> None:
         signal.signal(number, signal.SIG_IGN)
     # The parent may have ignored SIGCHLD. In that case, the exit status of a player could not be read.
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    # These imports take time. They come after `_die_with_parent`, because the server may exit in the meantime.
+    # These slow imports come after `_die_with_parent`, because the server may exit while they run.
     from talkcli.engine.child.driver import CannotStart, start
     from talkcli.engine.child.players.base import CannotKillPlayer
     from talkcli.engine.child.players.chooser import PlayerChooser

@@ -161,7 +161,7 @@ class PlayerFeed:
         self.player = player
         #: maximum number of bytes to offer at once
         self.piece_bytes = int(PIECE_S * rate) * SAMPLE_BYTES
-        #: number of bytes consumed when the progress was last recorded, including silence
+        #: number of bytes consumed at the last check, including silence
         self.consumed = 0
         #: number of bytes written to the player, including silence
         self.written = 0
@@ -169,7 +169,7 @@ class PlayerFeed:
         self.progress_at = time.monotonic()
         self._rate = rate
         self._clock = clock
-        #: time at which the stream began. Each wait for missing text moves it forward by the length of the wait.
+        #: time at which the stream began. Each wait for missing text moves this time forward by the length of the wait.
         self.began_at = 0.0
         #: time at which everything written will have been heard
         self._heard_at = 0.0
@@ -273,12 +273,12 @@ class Playback:
         self._players = runner.players
         self._on_word = on_word
         self._rate = 0
-        #: functions that open the remaining players, best first; None to try all players
+        #: functions that open the remaining players, best first; None means all players
         self._untried: Iterator[Callable[[], Player]] | None = None
         self._feed: PlayerFeed | None = None
         self._first_error: CannotSpeak | None = None
         self._clock = WordClock()
-        #: the samples; once the player is known to work, only those not heard yet
+        #: all samples of the sentence; once the player is known to work, only those not heard yet
         self._samples = SentenceSamples()
         self._complete = False  # whether all samples were written
         self._begin = 0  # offset of the current player's first sample
@@ -290,21 +290,22 @@ class Playback:
         self._skipped = 0
         #: monotonic time at which to stop retrying a busy device; 0 if no device was busy
         self._busy_until = 0.0
-        #: whether another thread synthesizes the samples. They may then be late.
+        #: whether another thread synthesizes the samples, which may then arrive late
         self._in_background = False
-        #: whether the player may have run dry because the text was missing, which doesn't count as a gap
+        #: whether the player may have run out of samples because text was missing. Such a silence doesn't count as a
+        #: gap.
         self._text_was_missing = False
         #: the part of the text that is being synthesized
         self._part: SpokenText | None = None
         #: offset in the samples at which the part begins
         self._part_begin = 0
-        #: whether another part may follow. It can be synthesized during the pause before it.
+        #: whether another part may follow. That part can be synthesized during the pause after the current one.
         self._part_follows = False
         #: lengths in seconds of the gaps caused by late samples
         self.gaps: list[float] = []
         #: time at which the player began to play silence during a pause
         self._silent_at: float | None = None
-        #: seconds of the sentence that had been heard when it was stopped or finished; None before that
+        #: seconds of the sentence that were heard; None until the sentence has ended or was stopped
         self._heard: float | None = None
 
     # -- methods for the synthesizer
@@ -379,7 +380,7 @@ class Playback:
         """
         if self._feed is None or not self._feed.player.real_time:
             return 0.0
-        unsent = self._seconds(self._sendable_end(self._feed) - self._sent)  # without silence that is held back
+        unsent = self._seconds(self._sendable_end(self._feed) - self._sent)  # silence that is held back doesn't count
         # The clock doesn't count the last milliseconds as heard until all samples have been sent.
         return max(0.0, self._feed.buffered(time.monotonic()) + unsent - MIN_PLAYER_BUFFER_S)
 
@@ -571,7 +572,7 @@ class Playback:
         while not player.ended():
             self._update_progress(feed)
             now = time.monotonic()
-            # If less sound is left, let the player finish.
+            # If little sound is left, let the player finish instead of killing it for a pause.
             if self._runner.hold_number and feed.buffered(now) > HOLD_SILENCE_LIMIT_S:
                 self._release_and_rewind(feed)
                 raise _PlayerReleased

@@ -59,7 +59,7 @@ REPORTED_CHARS = 1_000
 class Channel:
     """The engine process's connection to the server."""
 
-    #: standard input, which is the socket
+    #: standard input, which is the socket to the server
     descriptor = 0
 
     def __init__(self) -> None:
@@ -101,12 +101,11 @@ class ActiveGoal:
         self.id = command.id
         self.command = command
         self._markdown = _make_markdown_reader() if command.format == MARKDOWN else None
-        #: the text without the marks of Markdown. All offsets are the same as in the sender's text.
+        #: the text without Markdown marks. All offsets are the same as in the sender's text.
         self.text = self._remove_markdown(command.text, ended=not command.more)
         #: the text, if it may still grow
         self.growing_text = _make_growing_text(self.text, command) if command.more or command.broken else None
         self.text_missing = False
-        #: how to say terms in the text
         #: number of characters received, and how many of them the server knows to be received
         self.length, self.reported_length = len(command.text), 0
         self.words = WordFinder(self.text, max(command.start, command.heard_end), command.heard_words)
@@ -128,7 +127,7 @@ class ActiveGoal:
         #: the last output and the last voice reported to the server
         self.reported_output: Output | None = None
         self.reported_voice = ""
-        #: human-readable reason for a fallback voice; None for the requested voice
+        #: human-readable reason for a fallback voice; None if the requested voice speaks
         self.fallback_reason: str | None = None
         #: number of the last pause that was confirmed to the server
         self.confirmed_hold = 0
@@ -179,18 +178,20 @@ class GoalRunner:
         self._set_properties: Any = None
         self._step_run_loop: Callable[[], None] | None = None
         self._synthesizer: CombinedSynthesizer | None = None
-        #: number of the current pause, or 0; read by the playback, because pyttsx3 has no method for pausing
+        #: number of the current pause, or 0. The playback reads the number here, because pyttsx3 has no method for
+        #: pausing.
         self.hold_number = 0
-        #: time by which the current word must end, because the goal was interrupted; None otherwise
+        #: time by which the current word must end after an interruption; None if the goal wasn't interrupted
         self.word_end_due: float | None = None
         # Only `talk`'s own driver sets these attributes. pyttsx3's notifications have no fields for them.
+
         #: the word being reported; None with a third-party driver
         self.word: TimedWord | None = None
         #: length of the last sentence in seconds; None if it wasn't heard completely
         self.duration: float | None = None
         #: seconds of the last sentence that were heard; None if unknown
         self.heard: float | None = None
-        #: how the last sentence was interrupted; None if it wasn't
+        #: how the last sentence was interrupted; None if it wasn't interrupted
         self.ended_early: EndedEarly | None = None
         #: lengths in seconds of the gaps in the last sentence
         self.gaps: list[float] = []
@@ -428,7 +429,8 @@ class GoalRunner:
         goal.progress_at = goal.resumed_at = time.monotonic()
         goal.offset = goal.last_word
         goal.with_driver, goal.interrupted = True, False
-        # pyttsx3 refuses blanks, so a growing text is sent with its marks. The driver ignores this text anyway.
+        # pyttsx3 refuses a blank text, so a growing text is passed with its marks. The driver ignores the passed text
+        # anyway.
         text = goal.command.text if goal.growing_text else goal.text
         if self._step_run_loop is not None:
             text = goal.text[goal.offset :]
@@ -447,7 +449,7 @@ class GoalRunner:
             self._fail_goal(Reason.ENGINE_FAILED, "the driver dropped the sentence")
         elif goal.error is not None:  # a driver never reports the end of a text if its `say` has failed
             self._engine.stop()
-            self._engine.proxy.setBusy(False)  # otherwise, pyttsx3 would not send the next text to the driver
+            self._engine.proxy.setBusy(False)  # otherwise, pyttsx3 would hold back the next text
             self._handle_driver_finished(goal.id, completed=False)
         else:
             self.wait(until=time.monotonic() + DRIVER_STEP_S)
@@ -496,7 +498,7 @@ class GoalRunner:
         elif error is None:
             self._fail_goal(Reason.ENGINE_FAILED, "the driver stopped before the end of the sentence")
         else:
-            traceback.print_exception(error)  # this goes to the server's log
+            traceback.print_exception(error)  # the traceback goes to the server's log
             self._fail_goal(Reason.ENGINE_FAILED, f"{type(error).__name__}: {error}")
 
     def _fail_goal(self, reason: Reason, message: str) -> None:
@@ -551,7 +553,7 @@ class GoalRunner:
 
 def _make_markdown_reader() -> MarkdownReader:
     """Create a reader for a goal's text in Markdown."""
-    from talkcli.engine.markdown import MarkdownReader  # rarely needed, and slow to import
+    from talkcli.engine.markdown import MarkdownReader  # this import is slow and rarely needed
 
     return MarkdownReader()
 
@@ -561,7 +563,7 @@ def _make_growing_text(text_so_far: str, command: protocol.Speak) -> GrowingText
 
     If the text broke off, an incomplete last sentence is left out.
     """
-    from talkcli.engine.child.cutting import GrowingText  # rarely needed, and slow to import
+    from talkcli.engine.child.cutting import GrowingText  # this import is slow and rarely needed
 
     text = GrowingText(text_so_far, ended=False, start=command.start)
     if command.broken:

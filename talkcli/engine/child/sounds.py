@@ -54,10 +54,10 @@ def play_sound(library: SoundLibrary, command: Speak, playback: Playback, requir
         raise CannotSpeak(*error.args) from error
     try:
         rate, pieces = (file.rate, _read_samples(file)) if file else (DEFAULT_RATE_HZ, _make_tones(command.text))
-        # At a lower rate than that of speech, a program's pipe would hold too much sound for an exact pause.
+        # At a rate below that of speech, a program's pipe would hold too much sound, and pauses would be inexact.
         player_rate = required_rate or rate * math.ceil(DEFAULT_RATE_HZ / rate)
         playback.begin_sound(player_rate)
-        skipped, count = command.start, 0  # the samples before an interruption are skipped
+        skipped, count = command.start, 0  # samples that were heard before an interruption are skipped
         for piece in pieces if player_rate == rate else resample(pieces, rate, player_rate):
             rest = piece[skipped:]
             skipped -= len(piece) - len(rest)
@@ -118,7 +118,7 @@ def resample(pieces: Iterable[array[int]], rate: int, new_rate: int) -> Iterator
     """
     averaged = max(1, rate // new_rate)
     step = rate / averaged / new_rate
-    #: samples that are not averaged yet, averages, and the position of the next new sample in the averages
+    #: samples that are not averaged yet, unused averages, and the position among them of the next sample to yield
     rest, kept, position = array("h"), array("h"), 0.0
     for piece in chain(pieces, [array("h", [0] * averaged)]):  # the last sample is followed by silence
         rest += piece
@@ -126,7 +126,7 @@ def resample(pieces: Iterable[array[int]], rate: int, new_rate: int) -> Iterator
         columns = [rest[each:end:averaged] for each in range(averaged)]
         kept.extend([sum(each) // averaged for each in zip(*columns, strict=True)])
         del rest[:end]
-        # Rounding errors must not lead to a place after the last pair of averages.
+        # Rounding errors must not produce a position after the last pair of averages.
         count = max(0, math.ceil((len(kept) - 1 - position) / step - 1e-6))
         places = [position + number * step for number in range(count)]
         pairs = [(kept[int(each)], kept[int(each) + 1], each % 1) for each in places]

@@ -56,9 +56,9 @@ class WordFinder:
             return None
         reported = self.text[location : location + max(length, 0)]
         if reported.isspace() and self.text[self._end : location].strip():
-            # After a full stop, the reported location of the next word is one too low ("I go. this one is"). A blank
-            # directly after the previous word isn't a new word. It is reported for the second half of an emoji's name
-            # ("smiling face").
+            # After a full stop, the reported location of the next word is one character too low ("I go. this one is").
+            # A blank directly after the previous word isn't a new word. Such a blank is reported for the second half of
+            # an emoji's name ("smiling face").
             reported = self.text[location:]
         start = location + len(reported) - len(reported.lstrip())
         parts = reported.split(maxsplit=1)

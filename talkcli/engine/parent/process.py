@@ -173,13 +173,13 @@ class EngineProcess:
     def reap(self) -> str:
         """Wait briefly for the process to exit, and kill it if it doesn't. Return how it exited."""
         wait_ready({self.liveness: select.POLLIN}, _EXIT_WAIT_S)  # macOS doesn't report a closed end without POLLIN
-        self.kill()  # must happen before the process is reaped, because its group ID may be reused afterwards
+        self.kill()  # kill before reaping, because the group ID may be reused afterwards
         try:
             status = self._process.wait(_EXIT_WAIT_S)
         except subprocess.TimeoutExpired:
             return "it closed its connection"
         self.read_stderr()
-        self._report_stderr(b"\n")  # ends the last line, which may be incomplete
+        self._report_stderr(b"\n")  # the line break ends the last line, which may be incomplete
         how = f"it was killed by {signal_name(-status)}" if status < 0 else f"it exited with status {status}"
         return f"{how} ({self._last_stderr_line})" if self._last_stderr_line else how
 

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from typing import Any
 
-#: Failures that exit with the code of a rejected goal. All other failures exit with the code of an aborted goal.
+#: For these reasons, a failure exits with the code of a rejected goal. All other failures exit with the code of an
+#: aborted goal.
 _REJECTED_REASONS = frozenset({Reason.INVALID_TEXT, Reason.UNKNOWN_VOICE, Reason.BAD_OPTION})
 #: Failures of the player. When a text is rendered, the player writes the file, so these failures mean that the file
 #: can't be written.
@@ -104,9 +105,9 @@ def render(
         raise RenderFailed(*fault)
     sound = {each.name: getattr(DEFAULTS, each.name) for each in SOUND_OPTIONS} | sound
     if markdown:
-        from talkcli.engine.markdown import blank_markdown  # rarely needed, and slow to import
+        from talkcli.engine.markdown import blank_markdown  # this import is slow and rarely needed
 
-        text = blank_markdown(text)  # before the text is cut into pieces
+        text = blank_markdown(text)  # marks can't be recognized once the text is cut into pieces
     # A rendering can wait for its voice to load. A file with a different voice would be useless.
     numbered = enumerate(split_into_pieces(text), 1)
     more = {**sound, "voice_only": True, "pronunciations": pronunciations}

@@ -119,7 +119,7 @@ class RestartPolicy:
 
     def __init__(self, now: float) -> None:
         self.next_start_at = 0.0
-        #: error message of the last start, if the cause is permanent
+        #: error message of the last start; None if another start may succeed
         self.permanent_error: str | None = None
         self._failures = 0
         self._missing_since = now
@@ -195,6 +195,7 @@ class Supervisor:
             post: called in the engine thread with each report, including one `Ended` for each goal.
         """
         # This class doesn't inherit from Thread, because Thread's private names differ between Python versions.
+
         #: the engine thread, which starts engine processes. The owner starts the thread, and joins it after `close`.
         self.thread = threading.Thread(target=self._run, name="engine", daemon=True)
         self._configure = configure
@@ -294,13 +295,13 @@ class Supervisor:
         """
         try:
             while not self._closing:
-                # The time is taken before waiting. If the machine is suspended during the wait, messages that have
-                # arrived are then read before any deadline counts as missed.
+                # Take the time before waiting. If the machine is suspended during the wait, messages that have arrived
+                # are then read before any deadline counts as missed.
                 now, deadline = time.monotonic(), self._next_deadline()
                 self._wait_and_handle(deadline)
                 if now >= deadline and not self._closing:
                     self._handle_deadlines(now)
-            self._actions.run()  # actions submitted before `close`
+            self._actions.run()  # run actions that were submitted before `close`
         except Exception as error:
             self._closing = True
             self._post(ThreadDied(f"a bug in the engine thread: {type(error).__name__}: {error}"))
@@ -345,7 +346,7 @@ class Supervisor:
         elif self._process is None and now >= self._restarts.next_start_at:
             self._start_process()
         for process in [process for process, deadline in self._dying.items() if now >= deadline]:
-            self._dying[process] = NEVER  # do this only once; the process is still reaped when it exits
+            self._dying[process] = NEVER  # kill only once more; the process is still reaped when it exits
             process.kill()  # the first kill may have left processes alive if no descriptor was free
             if self._goal and self._goal.lost_process is process:
                 message = f"the player could not be stopped within {KILL_LIMIT_S:g} s"

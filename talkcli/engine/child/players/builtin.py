@@ -28,7 +28,7 @@ NULL_AHEAD_S = 0.061
 _WAV_HEADER = struct.Struct("<4sI4s4sIHHIIHH4sI")
 #: The number of header bytes that are included in the length after "RIFF".
 _RIFF_HEADER_BYTES = _WAV_HEADER.size - 8
-#: The value of both length fields in the header of a stream. Each field has 32 bits.
+#: The value of both 32-bit length fields in the header of a stream.
 _UNKNOWN_BYTES = 0xFFFFFFFF
 #: The offset of the sample rate in the header.
 _RATE_OFFSET = 24

@@ -34,14 +34,15 @@ _AUTOMATIC_CLASSES = [name for name, each in PLAYERS.items() if each.automatic a
 #: silence doesn't count as sound, because some loudspeakers switch off when they receive only silence.
 IDLE_AFTER_S = 1.0
 
-#: The number of handovers to remember for each player. Their median predicts the next one.
+#: How many handover times to remember for each player. Their median predicts the next handover time.
 MAX_HANDOVERS = 5
 
-#: Maximum seconds of silence to cut. This is half of the pause after a sentence. The other half is kept, so that the
-#: sentences stay separate.
+#: Maximum silence to cut from the end of a sentence, in seconds. This is half of the pause after a sentence. The other
+#: half is kept, so that the sentences stay separate.
 MAX_CUT_S = 0.12
 
-#: Longer handovers, in seconds, aren't counted, because the waiting goal was probably cancelled or paused.
+#: A handover that takes more seconds than this isn't counted, because the waiting goal was probably cancelled or
+#: paused.
 MAX_HANDOVER_S = 0.5
 
 
@@ -62,7 +63,7 @@ class HandoverTimes:
         #: whether another goal is waiting, and whether it needs a neural voice
         self.next_waits = self.next_is_neural = False
         self._measured: dict[tuple[str, bool], deque[float]] = {}
-        #: the player of the previous sentence and the time of its last sample, or None if no other goal was waiting
+        #: the previous sentence's player and the time of its last sample, or None if no other goal was waiting
         self._previous: tuple[str, float] | None = None
 
     @property

@@ -128,7 +128,7 @@ ChangeCallback = CFUNCTYPE(None, c_void_p, c_int, c_uint32, c_void_p)
 SinkCallback = CFUNCTYPE(None, c_void_p, POINTER(SinkInfo), c_int, c_void_p)
 SinkInputCallback = CFUNCTYPE(None, c_void_p, POINTER(SinkInputInfo), c_int, c_void_p)
 
-#: The types of the results and arguments of libpulse's functions, by name without the prefix "pa_".
+#: The types of results and arguments of libpulse's functions, by function name without the prefix "pa_".
 _SIGNATURES: tuple[tuple[str, Any, list[Any]], ...] = (
     ("mainloop_new", c_void_p, []),
     ("mainloop_free context_disconnect context_unref operation_unref stream_unref", None, [c_void_p]),
@@ -194,7 +194,7 @@ class MainLoop:
 
     def iterate(self) -> bool:
         """Run one iteration without waiting. Return whether it did any work."""
-        # If the second argument is 1, libpulse tells `_poll` how long it is until the next timer.
+        # If the second argument is 1, libpulse tells `_poll` how long to wait for the next timer.
         return not self.freed and bool(self._library.mainloop_iterate(self._pointer, 1, None) > 0)
 
     def free(self) -> None:

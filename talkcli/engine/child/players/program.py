@@ -71,7 +71,7 @@ _ERROR = (
     r"error|fail|cannot|can't|could ?n[o']t|unable|no such|not found|not available|refused|denied|invalid|unknown"
     r"|disconnected|busy|broken|terminated|killed|lost"
 )
-#: The source location in "aplay: main:831: text", which doesn't help users.
+#: Matches the beginning of a message such as "aplay: main:831: text". The source location doesn't help users.
 _SOURCE_LOCATION = r"^(?P<program>[^\s:]+): \w+:\d+: "
 
 #: Signals that Python ignores. Programs are started with the default actions for these signals.
@@ -144,8 +144,8 @@ class PlayerProcess:
         If the system can't report the exit, return at once.
         """
         if self.exit is not None and self._status is None:
-            # Don't use `wait_ready` here. This may run while the interpreter exits, when modules can't be imported any
-            # more.
+            # Don't use `wait_ready` here. This code may run while the interpreter exits, when no module can be imported
+            # any more.
             wait = select.poll()
             wait.register(self.exit, select.POLLIN)
             wait.poll(seconds * 1000)
@@ -182,7 +182,8 @@ def _attach_leash(read_end: int, group: int) -> None:
     """Make the kernel kill a process group when the write end of a pipe is closed."""
     if not hasattr(fcntl, "F_SETSIG"):
         return
-    with contextlib.suppress(OSError):  # if a sandbox forbids this, the program still exits when its input is closed
+    # Even if a sandbox forbids these calls, the program exits when its input is closed.
+    with contextlib.suppress(OSError):
         fcntl.fcntl(read_end, fcntl.F_SETOWN, -group)
         fcntl.fcntl(read_end, fcntl.F_SETSIG, signal.SIGKILL)
         fcntl.fcntl(read_end, fcntl.F_SETFL, fcntl.fcntl(read_end, fcntl.F_GETFL) | os.O_ASYNC)

@@ -30,7 +30,7 @@ REQUEST_MS = 15
 #: and sets the real volume a millisecond later.
 VOLUME_SETTLES_S = 0.1
 
-#: Seconds that the server has to create the stream. It usually takes 1 to 20 ms. If the server hangs, another player
+#: Time limit in seconds for creating the stream, which usually takes 1 to 20 ms. If the server hangs, another player
 #: can play the sentence, because this player hasn't accepted any samples yet.
 READY_LIMIT_S = 2.0
 
@@ -38,8 +38,8 @@ READY_LIMIT_S = 2.0
 SUSPENDED_LIMIT_S = 0.5
 
 #: Until the first sound is heard, the player asks the server for the playback time this many seconds after each answer.
-#: It asks so often because the first word must be reported as soon as it is heard. The first sound takes 1 to 10 ms on
-#: local devices and 200 ms over Bluetooth.
+#: The interval is short because the first word must be reported as soon as it is heard. The first sound takes 1 to 10
+#: ms on local devices and 200 ms over Bluetooth.
 TIME_REQUEST_S = 0.002
 
 
@@ -115,7 +115,7 @@ class PulsePlayer(Player):
         if self._context is None:
             self._loop.free()
             raise CannotSpeak(Reason.NO_PLAYER, "libpulse could not create a connection; free some memory")
-        # errors show up in the state of the context
+        # an error appears in the state of the context
         self._lib.context_connect(self._context, None, libpulse.NO_AUTOSPAWN, None)
         self._run_libpulse()
         if self._error is not None:
@@ -355,7 +355,7 @@ class PulsePlayer(Player):
             reason, message = Reason.NO_PLAYER, f"no sound server is running: {words}"
         elif self._stream is None:
             message = f"the sound server rejected the connection: {words}"
-        # Here, the error number may belong to a request for a sink that was removed.
+        # Here, the error number may belong to a request for a sink that no longer exists.
         elif self._sink_index != libpulse.NO_INDEX:
             message = "the sound server ended the stream"
         elif number == libpulse.NO_ENTITY and self._wanted_device is not None:
@@ -390,7 +390,7 @@ class PulsePlayer(Player):
         if not success:
             self._record_failure()
             return
-        self._follow_sink()  # the stream may have been moved in the meantime
+        self._follow_sink()  # the stream may have been moved to another sink
         self._volume_settled_at = 0.0
         self._record_mute()
         self._drained = self.proven = self._error is None

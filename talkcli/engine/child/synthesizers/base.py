@@ -35,7 +35,7 @@ class SpeechSettings:
     pitch: int = 50  # 0 to 100; 50 is the voice's natural pitch
     voice_only: bool = False  # whether to fail if the voice can't be used, instead of using another one
     begins_text: bool = True  # whether this is the first part of a text; silence before it may be cut
-    ends_text: bool = True  # whether this is the last part of a text; a pause follows even without a mark
+    ends_text: bool = True  # whether this is the last part of a text; a pause follows even without a punctuation mark
     phonemes: bool = False  # whether "[[" and "]]" in the text enclose phonemes of libespeak-ng
 
 

@@ -33,7 +33,7 @@ class CombinedSynthesizer:
         self._current: Synthesizer = self._espeak
         self.version = self._espeak.version
         self.voice = self._espeak.voice
-        #: reason why libespeak-ng speaks the current text instead of a neural voice, if it does
+        #: reason why libespeak-ng speaks the current text instead of a neural voice, or None
         self._fallback_reason: str | None = None
 
     def voices(self) -> tuple[Voice, ...]:

@@ -39,8 +39,8 @@ _CALLBACK_MS = 20
 #: A flag that stops the library from calling exit() if its data is missing.
 _DONT_EXIT = 0x8000
 
-#: Two names of the English voice. The first is a file name, so the library doesn't have to read all voices to find it.
-#: This saves 4 to 40 ms.
+#: Two names of the English voice. The first is a file name, with which the library finds the voice without reading all
+#: others. This saves 4 to 40 ms.
 _ENGLISH = ("gmw/en", "en")
 
 #: A flag with which `[[` and `]]` enclose phonemes. pyttsx3's binding doesn't define it.
@@ -60,7 +60,7 @@ _IPA = 2
 
 #: If the library is asked for these languages, it lists its variants or the MBROLA voices.
 _VARIANTS, _MBROLA = b"variant", b"mbrola"
-#: Where the data of an MBROLA voice may be. The library also needs the program mbrola to use such a voice.
+#: Paths of the data of an MBROLA voice. The library also needs the program mbrola to use such a voice.
 _MBROLA_PATHS = ("/usr/share/mbrola/{0}", "/usr/share/mbrola/{0}/{0}", "/usr/share/mbrola/voices/{0}")
 
 
@@ -186,7 +186,8 @@ class Espeak:
             UnknownVoice: One of the voice's files is missing. The library keeps the previous voice.
         """
         self._finish_phonemizer()
-        # Forget the rate, so that it is set again. Otherwise some voices would make the next one up to a third slower.
+        # Forget the rate, so that the next text sets it again. Otherwise, some voices would slow down the next voice by
+        # up to a third.
         self._parameters.clear()
         if not voice or self._espeak.SetVoiceByName(voice.encode("utf-8", "replace")) != self._espeak.EE_OK:
             # Even after an error, the library has switched to the new voice. If a file of that voice is missing, the
@@ -307,7 +308,7 @@ class EspeakPhonemizer:
         self._espeak = espeak
         self._voice = voice
         self._flags = espeak.CHARS_UTF8 | (_PHONEMES if phonemes else 0)
-        #: a lock that is held during each call of the library
+        #: a lock that is held during each call to the library
         self.busy = threading.Lock()
         self._ended = False
         self._to_phonemes = espeak.dll.espeak_TextToPhonemes
@@ -315,9 +316,10 @@ class EspeakPhonemizer:
 
     def clauses(self, text: str) -> list[tuple[str, str]]:
         """Split a text into clauses. Return pairs of a clause's text and its phonemes in IPA."""
-        # The next calls treat phonemes as the last call of `Synth` did, so speak a blank with the right flags.
+        # The next calls treat phonemes in the same way as the last call of `Synth`, so speak a blank with the right
+        # flags.
         self._speak_silently(" ")
-        # The library reads ahead, and any other call discards that text. So get all clauses before doing anything else.
+        # The library reads ahead, and any other call would discard the text that it has read. Get all clauses first.
         raw = ctypes.create_string_buffer(guard.guarded(text, self._voice).encode("utf-8", "replace"))
         base = ctypes.addressof(raw)
         at = ctypes.c_void_p(base)

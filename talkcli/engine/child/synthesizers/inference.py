@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from talkcli.engine.child.synthesizers.vits import Buffer
     from talkcli.engine.models import VoiceDescription
 
-os.environ.update(PACKAGE_VARIABLES)  # must be set before the packages are imported
+os.environ.update(PACKAGE_VARIABLES)  # these variables must be set before the packages are imported
 
 #: How many extra frames to decode before and after a part, because they affect its samples. The calculated value for
 #: Piper's largest decoder ("high") is 13.4. With 10 frames, the samples of a "medium" decoder differ by 1 in 400,000.
@@ -51,7 +51,7 @@ _MAX_ERROR_CHARS = 200
 #: The version of `vits.split_model`. Increase it whenever that function returns different halves, so that old cached
 #: halves are no longer used.
 _SPLIT_VERSION = 1
-#: The names of the inputs of every model, and of the extra input for the speaker.
+#: The names of the inputs that every model has, and of the extra input for the speaker.
 _INPUTS, _SPEAKER_INPUT = ("input", "input_lengths", "scales"), "sid"
 
 #: The maximum size of the cache, which has room for about eight voices. If the cache gets larger, the oldest files are
@@ -375,7 +375,8 @@ def _create_session(model: str | bytes, save_optimized_to: str | None = None) ->
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     # Turn off onnxruntime's memory arena, which never shrinks and doesn't make a model faster.
     options.enable_cpu_mem_arena = options.enable_mem_pattern = False
-    # A higher level takes 0.15 s longer and doesn't make the model faster. Its result fits only one type of processor.
+    # A higher optimization level takes 0.15 s longer and doesn't make the model faster. Its result can only be used on
+    # one type of processor.
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
     if save_optimized_to is not None:
         options.optimized_model_filepath = save_optimized_to

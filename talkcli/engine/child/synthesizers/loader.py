@@ -131,7 +131,7 @@ class ModelLoader:
         #: the private memory of the process before the first load, and how much it had grown at the last report
         self._initial_bytes: int | None = None
         self._reported_growth = 0
-        #: the reason to measure memory again: the id of a voice that has spoken, or "" if a voice was unloaded
+        #: why memory must be measured again: the id of a voice that has spoken, or "" if a voice was unloaded
         self._unmeasured: str | None = None
 
     @property
@@ -267,7 +267,7 @@ def _load_model(voice: str) -> Iterator[tuple[Model, _Fingerprints]]:
     if path is None:
         raise VoiceFileError(f"{voice}: its file no longer exists")
     try:
-        load_libraries(path)  # Import the libraries before reading any files, which may hang.
+        load_libraries(path)  # Import the libraries first, because reading the files may hang.
         fingerprints = _fingerprints(path)
         yield Model(path, models.read_description(path), _open_cache()), fingerprints
     except OSError as error:
@@ -305,5 +305,5 @@ def _trim_heap() -> None:
     """
     import ctypes
 
-    with contextlib.suppress(AttributeError):  # Other C libraries don't have this function.
+    with contextlib.suppress(AttributeError):  # Some C libraries don't have this function.
         ctypes.CDLL(None).malloc_trim(0)

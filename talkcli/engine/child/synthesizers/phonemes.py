@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 else:
     Protocol = object
 
-#: The maximum number of phonemes in one run of a model. The time and memory that it needs grow with the square of
-#: this number. On a PC, 250 phonemes take 0.25 s and 60 MB, and 800 phonemes take 2 s and 450 MB.
+#: The maximum number of phonemes in one run of a model. The time and memory for a run grow with the square of this
+#: number. On a PC, 250 phonemes take 0.25 s and 60 MB, and 800 phonemes take 2 s and 450 MB.
 MAX_PART_PHONEMES = 250
 #: The maximum number of phonemes in a part, not counting the punctuation mark at its end.
 _MAX_SECTION_PHONEMES = MAX_PART_PHONEMES - 1
@@ -73,7 +73,7 @@ class SpeechPart:
     phonemes: tuple[str, ...]
     #: for each word, the index of its first phoneme, its start in the text and its length. The indexes never decrease.
     words: tuple[tuple[int, int, int], ...]
-    #: whether a pause follows because the sentence ends here
+    #: whether the part ends a sentence, so that a pause follows
     ends_sentence: bool
 
 

@@ -37,8 +37,9 @@ if TYPE_CHECKING:
     #: the samples of a piece of sound, and the words that begin in it or later
     SpokenPart = tuple[bytes, WordTimes]
 
-#: How many frames to decode at a time, at first and at most. A small first part of 0.23 s is ready quickly. Later parts
-#: have up to 0.93 s, because extra frames have to be decoded before and after each part (`inference.CONTEXT_FRAMES`).
+#: The initial and the maximum number of frames to decode at a time. A small first part of 0.23 s is ready quickly.
+#: Later parts have up to 0.93 s, because extra frames have to be decoded before and after each part
+#: (`inference.CONTEXT_FRAMES`).
 _MIN_DECODED_FRAMES, _MAX_DECODED_FRAMES = 20, 80
 #: The maximum number of decoded parts that wait to be played. They have up to seven seconds of sound, so playback
 #: continues if the computer is busy for a while.
@@ -48,7 +49,7 @@ _MAX_PARTS_AHEAD = 8
 #: pauses of 0.24 to 0.28 s.
 _PAUSE_S, _PAUSE_LEVEL = 0.26, 0.01
 #: The level below which sound counts as silence at the start of a sentence (1.0 is full scale), and how much of this
-#: silence is kept. Models make 26 to 60 ms of it, which would delay every sentence.
+#: silence is kept. Models produce 26 to 60 ms of silence, which would delay every sentence.
 _LEADING_LEVEL, _LEADING_S = 0.0015, 0.005
 #: The minimum length of a pause between two words. If the silence is shorter, the second word is taken to begin where
 #: the first one ends, because the blank between them already sounds like the second word.
@@ -235,7 +236,7 @@ def _speak_parts(
             raise VoiceFileError(f"{model.path} produced no sound for a text; download the voice again")
         if part.ends_sentence and quiet < pause:
             yield bytes((pause - quiet) * SAMPLE_BYTES), ()
-    if unknown and first and settings.begins_text:  # the voice can speak other parts
+    if unknown and first and settings.begins_text:  # otherwise, the voice can speak other parts
         why = f"has no id for a phoneme of the text ({unknown[:20]})"
         raise VoiceFileError(f"{model.path}.json {why}; download both files from the same source")
 
