@@ -15,7 +15,7 @@ EXIT_ERROR = 1
 EXIT_USAGE = 2
 EXIT_DIFFER = 13  # several robots failed with different exit codes
 EXIT_TIMEOUT = 124  # the same exit code as timeout(1)
-EXIT_SIGNAL = 128  # add the signal's number, as a shell does
+EXIT_SIGNAL = 128  # the signal's number is added, as in a shell
 EXIT_SIGINT = EXIT_SIGNAL + 2
 EXIT_SIGPIPE = EXIT_SIGNAL + 13  # used if standard output is closed
 
@@ -143,7 +143,7 @@ class LineTooLong(BadRequest):
     code = "line_too_long"
 
 
-#: Exceptions by the server's error code. Clients raise RequestRefused for any other code.
+#: The exception for each error code of the server. Clients raise RequestRefused for any other code.
 _ERRORS_BY_CODE: dict[str, type[RequestRefused]] = {
     **{each.code: each for each in (UnknownGoal, Busy, BadOption)},
     "unknown_voice": BadOption,

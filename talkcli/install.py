@@ -26,11 +26,11 @@ class Environment:
     """The properties of a Python environment that matter for installing packages."""
 
     python: str  # path to the interpreter
-    pipx: str | None = None  # directory of the environment if it was created by pipx
+    pipx: str | None = None  # directory of the environment, if pipx created it
     user_home: str = ""
     has_pip: bool = True
     made_by_uv: bool = False
-    externally_managed: bool = False  # pip needs --break-system-packages
+    externally_managed: bool = False  # whether pip needs --break-system-packages
     needs_sudo: bool = False
 
 
@@ -106,5 +106,5 @@ def _is_made_by_uv() -> bool:
     try:
         with open(os.path.join(sys.prefix, "pyvenv.cfg"), encoding="utf-8") as file:
             return any(line.startswith("uv =") for line in file)
-    except FileNotFoundError:  # this is not a virtual environment
+    except FileNotFoundError:  # Python doesn't run in a virtual environment
         return False

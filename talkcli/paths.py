@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 #: File name of the socket.
 SOCKET_NAME = "talk.sock"
-#: Socket of the system-wide server. systemd creates the directory if the unit has `RuntimeDirectory=talk`.
+#: Socket of the system-wide server. systemd creates its directory if the unit has `RuntimeDirectory=talk`.
 SYSTEM_SOCKET = f"/run/talk/{SOCKET_NAME}"
 #: State directory of the system-wide server. systemd creates it if the unit has `StateDirectory=talk`.
 _SYSTEM_STATE_DIRECTORY = "/var/lib/talk"
@@ -86,8 +86,8 @@ def _runtime_directories(uid: int) -> list[str]:
     """Return the directories that platformdirs may use if XDG_RUNTIME_DIR isn't set."""
     if sys.platform == "darwin":
         return [os.path.expanduser("~/Library/Caches/TemporaryItems")]
-    # If systemd's directory doesn't exist, platformdirs uses the first writable one of these temporary directories. A
-    # client can't know which one the server used, so it tries all of them.
+    # If systemd's directory doesn't exist, platformdirs uses the first of these temporary directories that is writable.
+    # A client can't know which directory the server used, so it tries all of them.
     temporary = [os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP")]
     fallbacks = [
         os.path.join(os.path.abspath(each), f"runtime-{uid}") for each in [*temporary, "/tmp", "/var/tmp"] if each
@@ -139,7 +139,8 @@ def server_socket(named: str | None) -> str:
     import platformdirs
 
     with warnings.catch_warnings():
-        # platformdirs warns if XDG_RUNTIME_DIR isn't set, but clients also try the directory that it uses instead.
+        # If XDG_RUNTIME_DIR isn't set, platformdirs prints a warning and uses another directory. Clients try that
+        # directory, too.
         warnings.simplefilter("ignore", platformdirs.RuntimeDirWarning)
         try:
             return str(platformdirs.PlatformDirs("talk", appauthor=False).place_runtime_file(SOCKET_NAME))
@@ -169,7 +170,8 @@ def cache_directory() -> str:
     """Return the path of the cache directory, which may not exist yet."""
     given = os.environ.get("CACHE_DIRECTORY")
     if given:
-        return os.path.realpath(given.split(":")[0])  # this is a symbolic link if the unit sets DynamicUser=
+        # CACHE_DIRECTORY names a symbolic link if the unit sets DynamicUser=.
+        return os.path.realpath(given.split(":")[0])
     return os.path.join(_user_directory(os.environ.get("XDG_CACHE_HOME"), "~/.cache"), "talk")
 
 

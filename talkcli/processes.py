@@ -40,7 +40,8 @@ def close(*descriptors: int) -> None:
 
 def is_held(pipe: int, seconds: float = 0.0) -> bool:
     """Wait up to `seconds` for the other end of a pipe to close. Return whether it is still open."""
-    # Don't use `wait_ready` here. A player may be killed while the interpreter exits, when modules can't be imported.
+    # Don't use `wait_ready` here, because it imports modules. A player may be killed while the interpreter exits, when
+    # modules can't be imported.
     poll = select.poll()
     poll.register(pipe, 0)  # Linux reports that the other end was closed even if no events are requested
     return not poll.poll(seconds * 1000)
@@ -54,7 +55,7 @@ def kill_holders(pipe: int) -> bool:
     if not is_held(pipe, _RELEASE_S):
         return False
     link, own = f"pipe:[{os.fstat(pipe).st_ino}]", os.getpid()
-    # Stop as soon as the pipe is closed, because reading all of a busy machine's /proc takes tenths of a second.
+    # Stop as soon as the pipe is closed, because reading all of /proc can take tenths of a second on a busy machine.
     while_held = itertools.takewhile(lambda _: is_held(pipe, 0), process_ids())
     return kill(pid for pid in while_held if pid != own and link in _read_links(f"/proc/{pid}/fd"))
 

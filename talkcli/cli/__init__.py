@@ -55,7 +55,7 @@ def _prepare_streams() -> None:
         try:
             os.fstat(descriptor)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # `open` returns the lowest free descriptor, which is this one
+            os.open(os.devnull, os.O_RDWR)  # `open` returns the lowest free descriptor, which is the closed one
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")

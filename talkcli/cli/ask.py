@@ -213,7 +213,7 @@ def _suggest_similar_key(unknown_key: str, client: Client) -> None:
     try:
         status = client.status()
     except TalkError:
-        return  # the suggestion is optional, so this isn't an error
+        return  # the suggestion is optional, so ignore the error
     near = nearest(unknown_key, {each.key for each in unfinished(status) if each.key})
     if near:
         note(f"no goal has the key '{printable(unknown_key)}'; did you mean '{printable(near)}'?")

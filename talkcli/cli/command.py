@@ -30,7 +30,7 @@ FILE_MODE = Kind("string", (str,), "must be a string", "MODE")
 #: How many seconds a command waits. The time may be infinite.
 TIME_LIMIT = Kind("number", (int, float), "must be a number", "TIME", time_unit="s")
 
-#: The units of time that can follow a number, in milliseconds.
+#: The units of time that can follow a number, with their lengths in milliseconds.
 _TIME_UNITS_MS = {"ms": 1, "s": 1_000, "m": 60_000, "h": 3_600_000}
 #: Error messages for a value that is not a time, by the unit of the option.
 _NOT_A_TIME = {
@@ -38,7 +38,7 @@ _NOT_A_TIME = {
     "ms": "must be a time in whole milliseconds, such as 300ms or 0.3s",
 }
 
-#: The words for a day, with the number of days before today. Without a word, it is today.
+#: Words for a day, with the number of days before today. An empty word means today.
 _DAYS_AGO = {"": 0, "today": 0, "yesterday": 1}
 #: Options that can't be used with several robots.
 _SINGLE_ROBOT_OPTIONS = ("lines", "ahead", "stream", "feedback", "output", "list", "pronounce", "dry_run")

@@ -123,7 +123,7 @@ class _TerminalFeedback(Feedback):
             if line:
                 line.paused = event.paused
         else:
-            # The line shows another goal until this one is spoken.
+            # The line may show another goal until the event's goal is spoken.
             if line is None or (line.goal.id != goal.id and _is_spoken(event)):
                 line = self._line = _GoalLine(goal)
             if line.goal.id == goal.id:

@@ -77,7 +77,8 @@ class Interrupts:
         os.set_blocking(self._write, False)
         #: the poll events to wait for, by file descriptor; callers may add other descriptors
         self.watched = {self._descriptor: select.POLLIN}
-        if self._output and not _poll_output() & select.POLLNVAL:  # with POLLNVAL, every wait would end at once
+        # A descriptor with POLLNVAL would end every wait at once.
+        if self._output and not _poll_output() & select.POLLNVAL:
             self.watched[STDOUT_FD] = 0
         # Python runs signal handlers with a delay, so a handler couldn't end a wait that is just starting. The wakeup
         # descriptor is written immediately.

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from talkcli.cli.show import CommonOptions
     from talkcli.client.client import Client
 
-#: The server's error code if it can't read its history. A test compares the two.
+#: The error code of a server that can't read its history. A test compares it with the server's constant.
 HISTORY_FAILED = "history_failed"
-#: How long to search in the file if no server is running.
+#: Time limit for searching the history file if no server is running.
 _SEARCH_LIMIT_S = 60.0
 
 

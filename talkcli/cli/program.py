@@ -24,7 +24,7 @@ def run_program(command: Sequence[str]) -> int:
     Raises TalkError with the exit code 126 or 127 if the program can't be started. After this call, this process no
     longer receives the signals.
     """
-    signal.signal(signal.SIGCHLD, lambda *_: None)  # an ignored signal can't be waited for everywhere
+    signal.signal(signal.SIGCHLD, lambda *_: None)  # some systems can't wait for an ignored signal
     unblocked = signal.pthread_sigmask(signal.SIG_BLOCK, _HANDLED_SIGNALS)
     unblock = partial(signal.pthread_sigmask, signal.SIG_SETMASK, unblocked)
     try:

@@ -48,7 +48,8 @@ _UNSAFE_CHARACTERS = "[\0-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]"
 _HOME_DIRECTORIES = ("/home/", "/root/", "/run/user/")
 #: Directories to which the system-wide server can write.
 _WRITABLE_DIRECTORIES = ("/run/talk/", "/var/cache/talk/")
-#: What to do if the system-wide service can't write to the path in an option, or read the path in any other option.
+#: Advice for a path to which the system-wide service can't write, by option. If the service can't read a path, the
+#: advice is `_LET_READ`.
 _HIDDEN_PATH_ADVICE = dict.fromkeys(("--socket", "--player file:"), "choose a path in /run/talk")
 _HIDDEN_PATH_ADVICE["--history"] = "leave out the path, so that the history is in /var/lib/talk"
 _LET_READ = "copy it into /etc/talk, and let everybody read it"
@@ -91,7 +92,7 @@ def _warn_about_sound(player: str, driver: str | None) -> None:
     if (not player or player in PACKAGES) and has_no_output(os.environ):
         note(_NO_DEVICE)
     if not player or (player in PLAYERS and player not in PACKAGES):
-        return  # this player isn't an external program, so it can't be missing
+        return  # the player isn't an external program, so it can't be missing
     try:
         player_commands(player, None, 0)
     except PlayerMissing as error:

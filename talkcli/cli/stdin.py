@@ -121,7 +121,7 @@ class LineBuffer:
         self._ttl = ttl
         # Allow one more byte than the longest text has, because a line may end in CRLF.
         self._splitter = LineSplitter(MAX_TEXT_BYTES + 1)
-        #: chunks of input with the times at which they were read. Splitting them into lines late saves memory.
+        #: chunks of input with the times at which they were read; to save memory, they are split into lines late
         self._chunks: deque[tuple[float, bytes]] = deque()
         self._lines: deque[InputLine] = deque()
         self._number = 0
@@ -257,7 +257,7 @@ class InputSpeaker:
         except Interrupted:
             if watched.pop(0, None) is None:
                 raise
-            wait_ready({}, 0, watched)  # raises Interrupted again if there was also a signal or closed output
+            wait_ready({}, 0, watched)  # raises Interrupted if there is also a signal or closed output
             return _read_available()
         finally:
             watched.pop(0, None)

@@ -109,7 +109,7 @@ class GoalReporter:
             from talkcli.terminal.goals import describe_end
 
             words = describe_end(goal, name_client=not cancelled_here)
-            # The doctor can't find out why the text is unsuitable or incomplete.
+            # The doctor can't explain why a text is unsuitable or incomplete.
             if goal.state is State.ABORTED and goal.reason not in {"nothing_to_say", "text_stalled", "broken_off"}:
                 words += "; find out why with: talk doctor"
             self.feedback.note(f"{prefix}{words}")

@@ -126,7 +126,7 @@ class LocalExamination:
         if used and not is_neural(used):
             if engine.ready is not None:
                 used = engine.ready.voice
-            elif not find_voice(used, models.undescribed_voices(env)):  # this voice may be the cause
+            elif not find_voice(used, models.undescribed_voices(env)):  # the voice in use may be the cause
                 used = None
         needed = used or server_voices or any(map(is_neural, engine.voices or ())) or env.get("TALK_VOICES")
         if not needed or not is_own_driver(self._setting("driver")):

@@ -119,7 +119,7 @@ def speak_by_server(client: Client, text: str, limit: float) -> SentenceResult:
         try:
             if goal.speech_paused:
                 return SentenceResult(goal.cancel().state, "paused", f"not spoken: {describe_pause(goal.pause)}")
-            # The time of a word counts from the first sound.
+            # The time of a word is measured from the first sound.
             onsets = [time.monotonic() - word.time - asked_at for word in goal.feedback(limit)]
             result = _convert_ended_goal(goal.wait(limit))
             with contextlib.suppress(TalkError):  # the result is valid even if the server ends now

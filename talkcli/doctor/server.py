@@ -53,7 +53,7 @@ _REFUSAL_ADVICE = {
     "busy": "end some clients, or raise the limit in the message: talk serve --max-clients 512, or LimitNOFILE=",
     "permission_denied": "ask its owner for access: talk serve --socket-mode 0660, and join the socket's group",
 }
-#: Advice for each kind of place. If several kinds were found, the first one in this table counts.
+#: Advice for each kind of place. If several kinds were found, the first kind in this table counts.
 _PLACE_ADVICE = {
     PLACE_FORBIDDEN: "ask {whose} for access: talk serve --socket-mode 0660, and join the socket's group; "
     "or start your own server",

@@ -455,7 +455,7 @@ def judge_session(session: UserSession) -> Finding:
     who += f", in {' and '.join(session.origins)}" if session.origins else ""
     if session.runtime_dir is None:
         if session.usual_runtime_dir is None:
-            # This is normal on robots without logind, which would create the directory.
+            # Robots without logind normally have no such directory, because logind would create it.
             return ok("session", f"{who}; XDG_RUNTIME_DIR is not set, because this user has no login session")
         again = "" if session.server_pid is None else " for the server, and restart it"
         return warning(
@@ -539,7 +539,7 @@ def check_device(env: Mapping[str, str], player: str, configured: str | None) ->
     if not names:
         step = "connect a loudspeaker; in a container, pass the device to it"
         return warning("device", f"{command} lists no devices", step)
-    # A device such as plughw:1,0 may work even if ALSA doesn't list it. The sentence will show whether it does.
+    # A device such as plughw:1,0 may work even if ALSA doesn't list it. The test sentence will show whether it works.
     if configured is None or configured in names or ":" in configured:
         return ok("device", f"{used}; {command} lists {join_names(names)}")
     words = f"{configured} is not a device that {command} lists: {join_names(names)}"

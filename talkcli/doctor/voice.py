@@ -41,7 +41,7 @@ INSTALL_LIBRARY = install.espeak_command()
 _INSTALL_PYTTSX3 = install.command("pyttsx3")
 _INSTALL_NEURAL = install.neural_command()
 
-#: Advice if libespeak-ng can't be used. The key is a part of the engine's message, or the reason for the failure.
+#: Advice if libespeak-ng can't be used, by a part of the engine's message or by the reason for the failure.
 _LIBRARY_ADVICE = {
     "espeak-ng data": "sudo apt-get install -y espeak-ng-data",
     "libespeak-ng": INSTALL_LIBRARY,
@@ -59,7 +59,7 @@ _IMPORT_PROGRAM = "import sys; sys.tracebacklimit = 0; sys.path[:] = filter(None
 #: Time limit for an import, which is slow from an SD card.
 _IMPORT_LIMIT_S = 10.0
 _IMPORT_TIMED_OUT = f"it takes more than {_IMPORT_LIMIT_S:g} s"
-#: Advice if a package can't be imported. The key is a part of the error message, and "" is the default.
+#: Advice if a package can't be imported, by a part of the error message. The advice for "" is the default.
 _IMPORT_ADVICE = {
     _IMPORT_TIMED_OUT: "run talk doctor again when this machine is less busy",
     "SIGILL": "this processor is too old for that version: install an older version, or use an espeak voice",

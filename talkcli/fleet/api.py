@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from talkcli.fleet.payloads import Presence
 
 
-#: The class of a fleet's requests, which is FleetRequest in the blocking and in the asyncio library.
+#: The class of a fleet's requests: either the blocking or the asyncio `FleetRequest`.
 FleetRequestT = TypeVar("FleetRequestT")
 
 

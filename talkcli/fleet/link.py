@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
     #: Callback that receives the reason code of a PUBACK packet.
     OnAcknowledged = Callable[[int], None]
-    #: Callback that receives a topic and the reason code for it in a SUBACK packet.
+    #: Callback that receives a topic and its reason code from a SUBACK packet.
     OnSubscribed = Callable[[str, int], None]
 
 #: MQTT keepalive interval. The broker closes a connection if it receives nothing for one and a half intervals.
@@ -60,10 +60,12 @@ _MAX_UNACKNOWLEDGED_MESSAGES = 10
 MAX_RECEIVE_COUNT = 65_535
 # MQTT 5 reason codes. All codes from REASON_FAILURE upwards are failures.
 _REASONS_LOGIN_DENIED = (0x86, 0x87, 0x8A, 0x8C)
-#: The reasons why a user may not use a topic. Some brokers, such as ejabberd, call a topic that is not allowed invalid.
+#: Reason codes for a topic that a user may not use. Some brokers, such as ejabberd, report that such a topic is
+#: invalid.
 _REASONS_TOPIC_DENIED = (0x86, 0x87, 0x8A, 0x8C, 0x8F, 0x90)
 _REASON_UNSUPPORTED_PROTOCOL = 0x84
-#: What talk needs: the property of the broker's response that is 0 if this is missing, and the reason code to a login.
+#: The broker features that talk needs. If a feature is missing, this property of the broker's response is 0, or the
+#: login fails with this reason code. The last column is the name of the feature in error messages.
 _NEEDED_FEATURES = (
     ("MaximumQoS", 0x9B, "QoS 1"),
     ("RetainAvailable", 0x9A, "retained messages"),
@@ -122,7 +124,7 @@ class Link:
         self._deliver, self._on_subscribed = on_message, on_subscribed
         #: the topics of each unanswered subscription, by message id
         self._subscribing: dict[int, tuple[str, ...]] = {}
-        #: the features that talk needs and the broker doesn't have
+        #: the names of needed features that the broker doesn't support
         self._missing_features: list[str] = []
         self._max_packet_bytes, self._receive_maximum = max_packet_bytes, receive_maximum
         #: why the connection has ended; None if it hasn't
@@ -191,7 +193,8 @@ class Link:
         found = self._paho.socket()
         if isinstance(found, socket.socket):  # there is no socket if the broker has already closed the connection
             self._socket = found
-            # On macOS, this fails if the broker has reset the connection. The first read reports that.
+            # On macOS, setting this option fails if the broker has reset the connection. The first read reports the
+            # error.
             with contextlib.suppress(OSError):
                 # Nagle's algorithm would delay messages by 40 ms.
                 found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -356,9 +359,9 @@ class Link:
             words for name, missing, words in _NEEDED_FEATURES if code == missing or getattr(properties, name, 1) == 0
         ]
         receive_maximum = getattr(properties, "ReceiveMaximum", MAX_RECEIVE_COUNT)
-        # paho ignores this limit, and its public setter refuses to change it after the login.
+        # paho doesn't obey the broker's receive maximum, and its public setter can't be called after the login.
         self._paho._max_inflight_messages = min(_MAX_UNACKNOWLEDGED_MESSAGES, receive_maximum)
-        # Turn off paho's log, which is only needed to explain a failed login. It would use a tenth of the CPU time.
+        # Turn off paho's log, because it uses a tenth of the CPU time. It is only needed to explain a failed login.
         self._paho.on_log = None
         limit = getattr(properties, "MaximumPacketSize", MAX_PACKET_BYTES)
         self.max_payload_bytes = max(0, min(MAX_PACKET_BYTES, limit) - MAX_HEADER_BYTES)

@@ -19,7 +19,7 @@ ALL_ROBOTS = "all"
 ANY = "+"
 #: Stands for the robot's name in topics on which a client sends messages to itself. It isn't a valid robot name.
 MARKER = "_"
-#: The server knows a remote client by this prefix and the client's user name.
+#: Prefix of the name under which the server knows a remote client. The client's user name follows.
 REMOTE_PREFIX = "mqtt:"
 #: Maximum length of a robot, group or user name.
 MAX_NAME_CHARS = MAX_SENDER_NAME_CHARS - len(REMOTE_PREFIX)

@@ -110,7 +110,8 @@ class Goal:
     #: human-readable description of how the goal ended
     message: str | None = None
     format: str = "text"
-    #: text as it is said, if that differs from `text`; only set in replies about one goal and in goals from the history
+    #: text as it is spoken, if it differs from `text`; only set in replies about a single goal and in goals from the
+    #: history
     said: str | None = None
     #: text up to the end of the last word that has started
     spoken: str | None = None
@@ -124,7 +125,7 @@ class Goal:
     data: JsonObject | None = None
     client: Sender | None = None
     paused: bool = False
-    #: id of the goal that is spoken in the middle of this one, which continues afterwards
+    #: id of the goal that interrupts this one; afterwards, this goal continues
     interrupted_by: str | None = None
     #: whether the text may still grow
     more: bool = False
@@ -146,7 +147,7 @@ class Goal:
 
     def to_json(self) -> JsonObject:
         """Return the goal as a JSON object for clients."""
-        # A loop over the fields would be slower, and a busy server spends most of its time here.
+        # A loop over the fields would be slower, and a busy server spends most of its time in this method.
         return {
             "id": self.id,
             "state": self.state.name,

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _Key = TypeVar("_Key")
 _Value = TypeVar("_Value")
 
-#: Number of spoken goals to keep, enough for 100 minutes of a robot that speaks ten times a minute.
+#: Number of spoken goals to keep. A robot that speaks ten times a minute speaks this many goals in 100 minutes.
 MAX_SPOKEN_GOALS = 1_000
 #: Number of rejected goals to keep. Without a separate limit, one client's rejected goals could displace the results of
 #: other clients.
@@ -84,7 +84,7 @@ class SpeechTimes:
     """The start times of the last goals that were spoken, by key and by text."""
 
     def __init__(self) -> None:
-        #: start time and id of the last goal for each key and each hash of a text
+        #: start time and id of the last goal with each key, and of the last goal with each text, by the text's hash
         self._starts: OrderedDict[str | bytes, tuple[float, str]] = OrderedDict()
 
     def add(self, record: Record) -> None:

@@ -22,30 +22,31 @@ if TYPE_CHECKING:
     from talkcli.goals.reasons import Refusal
 
 MAX_ID_CHARS = 64
-#: Maximum number of ids in a request. More ids would not fit into a line.
+#: Maximum number of ids in a request. More ids would not fit into the request's line.
 MAX_IDS = 4096
 #: Maximum length of a client's name, which is shown on one line of a terminal.
 MAX_SENDER_NAME_CHARS = 64
 #: Maximum size of a goal's `data` as JSON. It is meant for labels, not for storage.
 MAX_DATA_BYTES = 1024
-#: Maximum number of goals in a reply to `log`, equal to the number of ended goals that the server keeps in memory.
+#: Maximum number of goals in a reply to `log`. The server keeps the same number of ended goals in memory.
 MAX_LOG_GOALS = 2_200
-#: Names of the states in which a goal can have ended. A test compares them with `State`, which is slow to import.
+#: Names of the final states of a goal. They are repeated here because `State` is slow to import, and a test compares
+#: them.
 END_STATES = ("SUCCEEDED", "ABORTED", "REJECTED", "RECALLED", "PREEMPTED")
-#: Maximum length of a text, enough for several minutes of speech. A longer text should be split, so that other goals
-#: can be spoken in between.
+#: Maximum length of a text, which is enough for several minutes of speech. A longer text should be split, so that other
+#: goals can be spoken in between.
 MAX_TEXT_CHARS = 10_000
 #: Maximum size of a text. 10,000 characters of four bytes each still fit into a request.
 MAX_TEXT_BYTES = 40_000
-#: A growing text may be this many times longer than other texts. It can be interrupted, and its sender sees how much of
-#: it was spoken.
+#: A growing text may be this many times as long as other texts. Clients can interrupt a growing text, and its sender
+#: sees how much of it was spoken.
 GROWTH_FACTOR = 5
-#: How long a growing text waits for more text after it was spoken: the default, the minimum and the maximum.
+#: How long a goal waits for more text after the text so far was spoken: the default, the minimum and the maximum.
 STALL_S, MIN_STALL_S, MAX_STALL_S = 5, 1, 60
-#: How long a pause lasts if it ends with its connection: the default limit, the minimum and the maximum. The limit ends
-#: the pause of a program that hangs.
+#: The time limit of a pause that ends with its connection: the default, the minimum and the maximum. It ends the pause
+#: of a program that hangs.
 PAUSE_S, MIN_PAUSE_S, MAX_PAUSE_S = 600, 0.1, 86_400
-#: How long a pause may last until the doctor and the log warn about it.
+#: How long a pause may last before the doctor and the log warn about it.
 LONG_PAUSE_S = 600
 #: Highest priority. Every JSON parser can represent this number exactly.
 MAX_PRIORITY = 1_000_000
@@ -97,7 +98,7 @@ class Kind:
     #: name of the type in the protocol's document
     name: str
     types: tuple[type, ...]
-    #: error message if a value has another type
+    #: error message for a value of another type
     wrong_type: str
     #: placeholder for the value in help texts, or an empty string to use the option's name
     metavar: str = ""
@@ -250,9 +251,9 @@ class Option:
     help: str = ""
     #: environment variable that is used if the option isn't given
     env: str = ""
-    #: value that the flag sets, if the option isn't boolean but its flag takes no argument
+    #: value that the flag sets, if the flag takes no argument and the option isn't boolean
     flag_value: Any = None
-    #: value if no argument follows the option's flag, which may then be left out
+    #: value if the flag is given without its optional argument
     bare_value: str | None = None
     #: name of the function in `cli.completion` that completes values
     completion: str = ""
@@ -424,7 +425,7 @@ OPTIONS = (
         INTEGER,
         "goals with a higher priority are spoken first, and goals with the same priority in the order of arrival",
         default=0,
-        # The range is not in `limits`, because the help text would then show it.
+        # The range is not in `limits`, because the help text would show it.
         check=_priority_error,
         form=f"{-MAX_PRIORITY:,} to {MAX_PRIORITY:,}",
         help="Set the priority. Sentences with a higher priority are spoken first. This sentence never interrupts or "

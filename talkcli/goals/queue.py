@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     _Entry = tuple[float, int, Record]
 
 _record_of = itemgetter(2)
-#: Difference between the positions of preempting goals, interjections and other goals. No server has so many goals.
+#: Offset that puts preempting goals before interjections, and both before other goals. No goal has a number this high.
 _POSITIONS = 2**40
 
 

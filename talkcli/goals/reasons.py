@@ -83,7 +83,7 @@ class Reason(str, Enum):
         "the sender of a growing text left, or gave up, before the text ended",
     )
     NOT_SILENT = "not_silent", (_ABORTED,), "the goal was stopped, but silence was not confirmed within 2 s"
-    # The next two reasons are set only by clients.
+    # Only clients set the next two reasons.
     NOT_SENT = "not_sent", (_REJECTED,), "the client could not send the goal, so it never reached a server"
     LOST = "lost", (_LOST,), "the connection to the server was lost before the goal ended"
 

@@ -63,7 +63,7 @@ class Record:
     broken: bool = False
     #: whether the goal is silent because the next part of its text is missing
     waits: bool = False
-    #: number of characters that were heard, or skipped before the goal waited for text
+    #: number of characters that were heard, or that had arrived when the goal ran out of text
     passed_chars: int = 0
     #: monotonic time by which more text must arrive, or inf
     stalls_at: float = inf

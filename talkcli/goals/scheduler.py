@@ -34,11 +34,11 @@ if TYPE_CHECKING:
     from talkcli.goals.options import Append, Cancel, Say, Set
 
 _BROKEN_OFF = "the text broke off before its end"
-#: Why a goal was stopped, if neither another goal nor its ttl ended it.
+#: Descriptions of the reasons for stopping a goal, except for interrupting goals and an expired ttl.
 _STOP_CAUSES = {Reason.CANCELED: "the goal was cancelled", Reason.SHUTDOWN: "the server was stopped"}
 #: Time limit for the engine to become silent after a stop. Every cancel must be answered within 2 s.
 CONFIRM_SILENCE_S = 1.9
-#: Maximum number of interrupted goals. With more of them, nobody could follow.
+#: Maximum number of interrupted goals. Listeners couldn't follow more of them.
 MAX_INTERRUPTED = 8
 
 
@@ -179,15 +179,17 @@ class Scheduler:
         self.active: Record | None = None
         #: the goals that were interrupted and will continue; the last one continues first
         self.interrupted: list[Record] = []
-        #: id of the interjection for which the active goal was told to end at the end of a word, or None
+        #: id of the interjection that interrupts the active goal at the end of a word, or None
         self._interrupter: str | None = None
         #: whether speech is paused
         self.paused = False
-        #: the pauses that end with a connection, by that connection. None is the key of the last one of all others.
+        #: the pauses that end with a connection, by connection. The key None is for the longest one of all other
+        #: pauses.
         self._pauses: dict[object, SpeechPause] = {}
-        #: whether goals can start. If no engine can be started, they start and fail at once.
+        #: whether goals can start. This is also true if no engine can be started, so that goals fail at once.
         self.has_engine = False
-        #: goals with incomplete texts whose sender left, and the time at which they end if nobody continues them
+        #: goals with incomplete texts whose senders have left, and the time at which each one ends if nobody continues
+        #: it
         self._orphans: dict[Record, float] = {}
         #: whether `shutdown` was called, so that new goals are rejected
         self.closing = False
@@ -435,7 +437,7 @@ class Scheduler:
         if isinstance(voice, str):
             self.voices.forget_failure(options.without_speaker(voice))
             self._request_voice(voice, now)
-        return self.tick(now)  # the next goal may not have to wait for its voice any more
+        return self.tick(now)  # the next goal may no longer have to wait for its voice
 
     def pause(self, client: Sender, now: Now, seconds: float | None = None, connection: object = None) -> list[Effect]:
         """Pause the active goal, and start no other goal until all pauses have ended. Return the effects.
@@ -562,7 +564,7 @@ class Scheduler:
         """
         record = self._require_active(goal_id)
         if start >= record.begun_end:
-            # This text may contain a word that is spoken together with the word before it.
+            # The text between two reported words may contain a word that was spoken together with the first one.
             between = record.say.text[record.begun_end : start]
             opening = [] if between[-1:].isspace() else between.split()[-1:]  # such as a quotation mark
             record.spoken_end = record.begun_end + len(between.removesuffix("".join(opening)).rstrip())
@@ -904,7 +906,7 @@ class Scheduler:
         needed = self._needed_voices()
         speaking = options.without_speaker(self.active.voice) if self.active else ""
         if options.is_neural(speaking) and not self.voices.is_loaded(speaking):
-            return []  # the speaking voice was already dropped, but its memory is freed only at the end of the goal
+            return []  # the speaking voice was already dropped, but its memory is only freed at the end of the goal
         return [*self.voices.drop_excess(next(iter(needed), speaking), needed)]
 
     # -- starting and ending goals

@@ -34,7 +34,7 @@ class State(IntEnum):
         return self.name
 
     def __format__(self, spec: str) -> str:
-        # Since Python 3.11, IntEnum formats as the number by default.
+        # Since Python 3.11, IntEnum members are formatted as numbers by default.
         return format(int(self) if spec.endswith("d") else self.name, spec)
 
 

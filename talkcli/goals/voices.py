@@ -26,7 +26,7 @@ VOICE_PATIENCE_S = 10.0
 #: How long before its expiry a goal stops waiting for its voice, so that it can still start.
 EXPIRY_MARGIN_S = 0.5
 #: Shortest and longest delay before a failed voice is loaded again. The delay doubles with each failure. A failed
-#: attempt costs a second of processor time, or even a sentence if the engine crashes.
+#: attempt takes a second of processor time, and a crash of the engine also breaks off the current sentence.
 MIN_VOICE_RETRY_S, MAX_VOICE_RETRY_S = 5.0, 3600.0
 #: A voice is considered faulty if the engine dies this many times in a row while loading it.
 MAX_ENGINE_DEATHS = 2
@@ -229,7 +229,7 @@ class VoiceScheduler:
 
         `error` says why loading failed. It is None if the voice was loaded.
         """
-        if voice == self._loading:  # the engine also loads voices without an order, for `voice_only` goals
+        if voice == self._loading:  # for `voice_only` goals, the engine also loads voices without an order
             self._loading = None
         found = self._voices.setdefault(voice, self._new_voice(voice))
         found.wanted = False

@@ -38,8 +38,8 @@ MAX_CONTENT_BYTES = 56_000_000
 MAX_WAL_BYTES = 7_000_000
 #: How long to wait while another process writes to the file.
 _LOCK_WAIT_S = 2.0
-#: With NORMAL, a crash of the server loses no written goal, and a power failure only the newest ones. Deleted texts are
-#: overwritten if this needs no further writing.
+#: With NORMAL, a crash of the server loses no written goals, and a power failure loses only the newest ones. With FAST,
+#: deleted texts are overwritten if this needs no additional writing.
 _PRAGMAS = """
 PRAGMA journal_mode = WAL; PRAGMA synchronous = NORMAL; PRAGMA secure_delete = FAST;
 PRAGMA wal_autocheckpoint = 256; PRAGMA journal_size_limit = 1048576;
@@ -60,7 +60,7 @@ DELETE FROM goals WHERE number <=
 _INSERT = f"INSERT INTO goals ({', '.join(COLUMNS)}) VALUES ({', '.join('?' * len(COLUMNS))})"
 #: SQLite's messages if the content of a file is invalid. Python 3.10 has no error codes.
 _DAMAGED = ("malformed", "not a database")
-#: Number of steps of a search between two checks of its time limit. They take about 1 ms.
+#: Number of steps of a search between two checks of its time limit. This many steps take about 1 ms.
 _STEPS_PER_CHECK = 100_000
 
 
@@ -77,7 +77,7 @@ class HistoryError(TalkError):
             file: the file that was used, or None if there was none.
         """
         super().__init__(getattr(error, "strerror", None) or str(error))
-        #: the file if its content is invalid, or else None
+        #: the file if its content is invalid, otherwise None
         self.damaged_file = file if any(each in str(error) for each in _DAMAGED) else None
 
 
@@ -89,7 +89,8 @@ class HistoryWriter:
         self._connection: sqlite3.Connection | None = None
         #: the file that was opened last
         self._file: FileIdentity | None = None
-        #: the time minus the monotonic time, and the monotonic time since when this is the same
+        #: the difference between the time of day and the monotonic time, and when this difference last changed
+        #: (monotonic)
         self._clock_offset, self._steady_since = math.inf, 0.0
 
     def write(self, goals: Sequence[Goal], damaged_file: FileIdentity | None = None) -> str | None:
@@ -129,7 +130,7 @@ class HistoryWriter:
         """Write goals, and delete old ones. If the file was removed, start a new one and return a message."""
         message = None
         if self._connection and _identity(self._path) != self._file:
-            self.close()  # before a new file is created, because this removes the WAL
+            self.close()  # before a new file is created, because closing removes the WAL
             message = f"{self._path} was removed or replaced, so a new history was started"
         connection = self._connection or self._open()
         wal = f"{self._path}-wal"

@@ -79,7 +79,7 @@ def to_row(goal: Goal) -> Row:
     shown = goal.to_json()
     other = {name: each for name, each in shown.items() if name not in _SEPARATE_FIELDS and each != _DEFAULTS[name]}
     if goal.spoken is not None and goal.text is not None:
-        other["spoken"] = len(goal.spoken)  # it is the beginning of the text
+        other["spoken"] = len(goal.spoken)  # the spoken part is the beginning of the text
     columns = {**filter_values(goal), "text": goal.text, "other": encode(other).decode()}
     return tuple(_storable(columns[name]) for name in COLUMNS)
 

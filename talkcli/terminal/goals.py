@@ -81,7 +81,8 @@ def describe_end(goal: Goal, name_client: bool = True) -> str:
     """
     words = printable(goal.message or goal.state.name)
     by_goal = goal.by and goal.by.goal
-    if goal.by and (f"by goal {by_goal}" not in words if by_goal else name_client):  # the message may name the goal
+    # The message may already name the goal.
+    if goal.by and (f"by goal {by_goal}" not in words if by_goal else name_client):
         words += f" ({_describe_cause(goal.by)})"
     return f"{printable(goal.id)}: {words}" if goal.id else words
 
@@ -216,7 +217,8 @@ def _tail_forms(goal: Goal, screen: Screen, now: float) -> list[str]:
     """Return alternative texts for the last column of a goal's line, longest first."""
     if goal.state.terminal:
         return listed_reason_forms(goal, screen)
-    # The sender is the most important detail. If there is no room, the other details are left out, the last one first.
+    # The sender is the most important detail. If there is no room, the other details are left out, starting with the
+    # last.
     senders, details = sender_forms(goal.client, screen), _unfinished_details(goal, screen, now)
     kept = range(len(details), -1, -1)
     return [", ".join([f"from {sender}", *details[:count]]) for count in kept for sender in senders]
@@ -334,7 +336,7 @@ def reason_forms(goal: Goal, screen: Screen) -> list[str]:
     if not words:
         return [*forms, shortest]
     forms = [f"{each}: {words}" for each in forms]
-    # Details from an engine or a player are more useful than the reason alone, even if they are cut.
+    # Details from an engine or a player are more useful than the reason alone, even if they are cut off.
     return forms if goal.state in {State.ABORTED, State.REJECTED} else [*forms, shortest]
 
 

@@ -25,7 +25,7 @@ _MIN_NAME_COLUMNS = 18
 _MIN_ID_COLUMNS = 12
 #: The minimum width to assume for a terminal, because shorter lines would be useless.
 MIN_COLUMNS = 40
-#: The maximum width of the text column if lines can have any length. A longer text moves the columns after it.
+#: The maximum width of the text column if lines can have any length. A longer text shifts the columns after it.
 TEXT_COLUMNS = 40
 #: The minimum width of a text if whole ids and process ids are shown.
 _MIN_TEXT_COLUMNS = 16
@@ -244,7 +244,7 @@ class MeasuredText:
         if excess > 0 and columns < 3:  # too narrow for two ellipses and a character between them
             return "", "", ""
         first = self._first_shown(min(self._columns[start] - columns // 3, excess), start)
-        # Reserve one column for an ellipsis at each end that is cut.
+        # At each end that is cut off, reserve one column for an ellipsis.
         room = columns - (first > 0)
         stop = self._count_fitting(self._columns[first] + room)
         if stop < last:
@@ -262,7 +262,7 @@ class MeasuredText:
         """Return the index of the first character to show right of `column`, at most `max_index`."""
         if column <= 0:
             return 0
-        # The ellipsis needs one more column. The first visible character must not be a combining mark.
+        # The ellipsis takes one more column. The first visible character must not be a combining mark.
         places = range(bisect_right(self._columns, column), max_index)
         return next((place for place in places if self._columns[place] < self._columns[place + 1]), max_index)
 

@@ -50,7 +50,7 @@ _FIRST_ID_COLUMNS = 3
 _MAX_NAME_COLUMNS = 20
 #: The indentation of continuation lines, which is the width of the time column.
 _INDENT_COLUMNS = 10
-#: Complete sentences and lines. Text that is added to a goal is shown when one of them is complete.
+#: Matches complete sentences and lines. Text that is added to a goal is shown once a sentence or line is complete.
 _COMPLETE_SENTENCES = re.compile(r".*(?:[.!?…][\"'”’»)]*\s|[。！？\n])", re.DOTALL)
 #: The maximum number of unfinished goals to remember. The oldest goal is dropped first.
 _MAX_REMEMBERED_GOALS = 1000
@@ -110,7 +110,7 @@ class Transcript:
         self._shown_chars: dict[str, int] = {}
         #: the goals that have spoken a word since they last waited for text
         self._heard: set[str] = set()
-        #: the goals that are interrupted
+        #: the interrupted goals
         self._interrupted: set[str] = set()
         self._paused = False
         self._robot, self._boot = robot, boot

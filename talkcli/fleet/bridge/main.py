@@ -42,7 +42,7 @@ _RIVAL_LIMIT_S = 1.0
 _FIRST_BROKER_RETRY_S, _LAST_BROKER_RETRY_S = 0.5, 10.0
 #: If no echo returns for this long, the bridge closes its connection to the broker.
 _ECHO_TIMEOUT_S = 15.0
-#: After refusing a stale message, the bridge sends an extra echo if the last one is at least this old.
+#: After refusing a stale message, the bridge sends an extra echo if the last echo is at least this old.
 _ECHO_PAUSE_S = 1.0
 #: If more data than this is unacknowledged, the bridge drops events and stops reading from the server.
 SLOW_BROKER_BYTES = 256 * 1024
@@ -254,14 +254,14 @@ class Bridge:
         self._claimed = False
         #: whether the broker has retained the presence of another bridge
         self._rival_seen = False
-        #: timer that brings the robot online unless another bridge answers. None until the broker returns the question
+        #: timer that brings the robot online if no other bridge uses its name; None until the timer starts
         self._rival_timer: asyncio.TimerHandle | None = None
         self._policy.newest_echo_at = boottime()
         self._loop.add_reader(self._descriptor, self._on_ready, Link.read)
         link.subscribe(self._presence_topic, retained=True)
         link.subscribe(self._echo_topic, retained=False)
-        # The broker sends the retained presence of another bridge before it returns this question. If that bridge is
-        # still running, its answer arrives afterwards.
+        # The broker sends any retained presence of another bridge before it returns this message. If the other bridge
+        # is still running, its answer arrives afterwards.
         self._publish(Message(self._echo_topic, _RIVAL_QUESTION + self._session.encode()))
         self._send_echo()
 
@@ -452,7 +452,7 @@ class Bridge:
         if rank and rank[1] == self._session:
             return
         if not self._rival_timer:
-            self._rival_seen = rank is not None  # this may come from a bridge that has already ended
+            self._rival_seen = rank is not None  # the presence may come from a bridge that has already ended
         elif rank is None:
             if self._online:
                 self._publish_presence()  # replace an invalid message, or a will that arrived late
@@ -499,7 +499,8 @@ class Bridge:
             return
         link.tick()
         self._check_link(link)
-        # Compare sending times. If this process was stopped for a while, it hasn't read the returned echoes yet.
+        # Compare sending times, because this process may have been stopped for a while and not have read returned
+        # echoes.
         if self._echo_at - self._policy.newest_echo_at > _ECHO_TIMEOUT_S:
             log.write_limited("echo", f"the broker does not return this robot's own messages; {_RIGHTS}")
             self._disconnect(link)
@@ -517,8 +518,8 @@ class Bridge:
         was_online = self._online and not isinstance(self._error, AddressInUse)
         self._online = False  # otherwise, the bridge would overwrite its own offline message
         # If another bridge is online, publish a message that has no effect, and wait until everything is acknowledged.
-        # Otherwise, `Link.close` would not send a DISCONNECT packet, and the broker would publish the will. The robot
-        # would seem to be offline.
+        # Otherwise, `Link.close` would not send a DISCONNECT packet. The broker would then publish the will, and the
+        # robot would seem to be offline.
         message = self._will if was_online else Message(self._echo_topic, f"{self._session} 0".encode())
         self._publish(message, on_acknowledged=lambda _: taken.set())
         with contextlib.suppress(asyncio.TimeoutError):

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 STALE_CODE = "stale"
 #: Requests that are always allowed. They reveal nothing that the bridge doesn't publish anyway.
 ALWAYS_ALLOWED = ("hello", "watch")
-#: Requests that are allowed if `say` is.
+#: Requests that are allowed if `say` is allowed.
 ALLOWED_WITH_SAY = (Append.kind, Sounds.kind)
 #: Requests that can be allowed with the option `--allow`.
 ALLOWABLE_REQUESTS = tuple(each for each in REQUEST_TYPES if each not in (*ALWAYS_ALLOWED, *ALLOWED_WITH_SAY))
@@ -42,10 +42,11 @@ STALE_AFTER_S = ECHO_EVERY_S + 1.0
 #: Maximum number of pending goals from remote clients. The server's queue has 100 places by default. The others
 #: are left to local clients.
 MAX_REMOTE_GOALS = 20
-#: How many messages of one user are processed in a second. Others are dropped, so that a flood can't delay other users.
+#: Maximum number of messages from one user per second. Further messages are dropped, so that they can't delay other
+#: users.
 MAX_MESSAGES_PER_S = 500
-#: A user may have this many times as many pending goals as there are free places. So one user has at most 15 of the 20
-#: places, and the next user finds at least 5 free.
+#: A user can send another goal if the user has fewer pending goals than this many times the free places. This limits
+#: one user to 15 of the 20 places, so that another user finds at least 5 free.
 _PENDING_PER_FREE_PLACE = 3
 #: How many goal ids to remember, so that no goal is spoken twice, even if the server has forgotten it.
 MAX_REMEMBERED_IDS = 1_000

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 #: Maximum number of sessions. Each has a connection to the server, which accepts 256 connections by default.
 MAX_SESSIONS = 32
-#: While another user needs a place, a user with more sessions than this loses the oldest of them.
+#: If another user needs a session, a user with more sessions than this may lose the oldest one.
 MAX_USER_SESSIONS = 8
 #: Maximum number of unanswered requests per client.
 MAX_WAITING_REQUESTS = 64
@@ -468,8 +468,8 @@ class RemoteSession:
         """Connect to the server, send queued requests, and publish lines until the connection ends."""
         shared = self._sessions
         try:
-            # If a session ends now, it keeps its slot until the server answers. If the server hangs, even closed
-            # connections take up space in its backlog.
+            # A session that ends while it connects keeps its slot until the server answers, because a hanging server's
+            # backlog also contains closed connections.
             async with shared.dialing:
                 if self._has_ended:
                     return

@@ -103,7 +103,7 @@ class DeskLink:
         self._opening: LinkOpener | None = None
         self._failed_attempts = 0
         self._next_attempt_at = self._polled_at = time.monotonic()
-        # If nobody calls `close`, the garbage collector closes sockets, but not pipes.
+        # Use sockets instead of a pipe, because the garbage collector closes them if nobody calls `close`.
         self._wake_reader, self._wake_writer = socket.socketpair()
         for each in (self._wake_reader, self._wake_writer):
             each.setblocking(False)

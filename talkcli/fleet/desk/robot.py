@@ -133,7 +133,7 @@ class RobotConnection(Connection):
         self._token: tuple[str, float] | None = None
         #: the token in the message that is being processed
         self._received_token: str | None = None
-        #: requests that are sent, in this order, after the robot has sent a token
+        #: requests to send, in this order, once the robot has sent a token
         self._awaiting_token: deque[Exchange] = deque()
         #: the request for a token that hasn't been answered yet
         self._token_request: Exchange | None = None
@@ -264,7 +264,7 @@ class RobotConnection(Connection):
                 self.fail(exchange, error)
             elif isinstance(exchange, RobotExchange) and isinstance(request, Say) and request.ttl:
                 left = (exchange.expires_at or 0.0) - boottime()
-                # Rounding up keeps a usual ttl unchanged, unless the token was late.
+                # Round up, so that a typical ttl stays the same unless the token was late.
                 exchange.request = replace(request, ttl=min(request.ttl, math.ceil(left * 10) / 10))
                 if left > 0:
                     self._send_now(exchange)
@@ -288,7 +288,7 @@ class RobotConnection(Connection):
     def answer_deadline(self, exchange: Exchange) -> float:
         """Return the time at which an exchange fails if its robot stays silent or absent."""
         if not isinstance(exchange, RobotExchange):
-            return float("inf")  # This exchange looks up a goal. After each absence, a new one is sent.
+            return float("inf")  # Lookups have no time limit, because they are sent again after each absence.
         if self.absent_since is None:
             by = super().answer_deadline(exchange)
         else:
@@ -421,7 +421,7 @@ class RobotConnection(Connection):
         begun = [each.request for each in self.exchanges.values() if each.sent]
         begun_ids = [str(each.id) for each in begun if isinstance(each, Say) and each.more]
         for goal_id in self.listeners.growing + begun_ids:
-            self._send_without_answer(Append(goal_id))  # Otherwise, the text would break off.
+            self._send_without_answer(Append(goal_id))  # Without this request, the text would break off.
         self._lookups.clear()
         interrupted = [each for each in self.exchanges.values() if isinstance(each, RobotExchange)]
         self.exchanges = {each.number: each for each in interrupted}
@@ -431,7 +431,7 @@ class RobotConnection(Connection):
             if exchange.sent and isinstance(exchange.request, Say):
                 self._look_up_goal(exchange, exchange.request, now)
             elif exchange.sent and isinstance(exchange.request, self.lasting):
-                # The robot may have carried out this request. If it were sent again, it could affect newer goals.
+                # The robot may already have carried out this request. A repeated request could affect newer goals.
                 self.fail(exchange, self._lost_error(exchange, self.absence))
             else:
                 self._resend(exchange)

@@ -84,7 +84,7 @@ class FleetRequestCalls:
         self._selection, self._name, self._interrupt, self._patience = selection, name, interrupt, patience_s
         #: all known robots by name, including those that came online too late to receive the request
         self._robots: dict[str, RobotRequest] = {}
-        #: the names of the robots that the request is for, and of those that haven't finished yet
+        #: the names of the robots that the request is for, and of the robots that haven't finished yet
         self._included, self._unfinished = set[str](), set[str]()
         self._outcomes: deque[Outcome] = deque()
         self._numbers = itertools.count(FIRST_SEQ)
@@ -188,7 +188,7 @@ class FleetRequestCalls:
         if group is not None:
             self._desk.send(Cancel((goal_id,)), next(self._numbers), group, self._on_refused, is_group=True)
         for name in list(self._unfinished):
-            # If a robot has left the group, it doesn't receive the message to the group.
+            # A robot that has left the group doesn't receive the message to the group, so it gets its own message.
             robot = self._robots[name]
             is_sent = group is not None and robot.presence is not None and self._selection.includes(robot.presence)
             robot.connection.cancel_after_absence(goal_id, also_now=not is_sent)
@@ -257,7 +257,7 @@ class FleetRequestCalls:
 
     def on_disconnected(self, why: str) -> None:
         """Treat all robots as absent until they are back, and ignore new robots from now on."""
-        # Ignore robots that appear after this, because the broker may be back too late.
+        # Ignore robots that appear later. When the broker is back, it may be too late to send them the request.
         self._complete = self._complete or self._began
         for each in self._robots.values():
             each.connection.on_disconnected(why)

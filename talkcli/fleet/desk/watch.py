@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from talkcli.fleet.link import Link
     from talkcli.goals.goal import JsonObject
 
-#: After the broker is back, bridges have this much time to reconnect. If a robot hasn't reported its presence by then,
-#: it counts as gone.
+#: After the broker is back, bridges have this much time to reconnect. A robot that hasn't reported its presence by then
+#: counts as gone.
 BRIDGES_BACK_LIMIT_S = 15.0
 #: How often to check whether a time limit has passed.
 _LIMIT_CHECK_INTERVAL_S = 0.5
@@ -180,7 +180,7 @@ class FleetWatch:
         self._reported: dict[str, dict[bool, str]] = {}
         #: the robots whose events may have been missed. Their next status message shows the goals that were missed.
         self._maybe_missed: set[str] = set()
-        #: the messages that have arrived on a new connection; None once all retained messages are there
+        #: the messages that have arrived on a new connection; None once all retained messages have arrived
         self._retained: list[Message] | None = None
         #: when the connection to the broker was lost (monotonic time) and why, or None if the broker is connected
         self._away_since: float | None = time.monotonic()
@@ -244,7 +244,7 @@ class FleetWatch:
                 self._missing.pop(name, None)
                 self._set_presence(name, presence if presence and self._selects(presence) else None)
         elif kind == topics.STATUS:
-            if name in self._maybe_missed:  # Otherwise, the robot's events have arrived, and they have more details.
+            if name in self._maybe_missed:  # Otherwise, events have already reported the goals, with more details.
                 self._report_missed(name, RobotStatus.read(message.payload))
         elif (event := _read_event(message)) is not None:
             self._report(event)
@@ -311,7 +311,7 @@ class FleetWatch:
         reported = self._reported.setdefault(name, {})
         missed = [each for each in events if reported.get(each.state.terminal) != each.id and each.id not in arrived]
         reported.update({each.state.terminal: each.id for each in events})
-        if events:  # If a bridge has just started, it may not know any goals yet.
+        if events:  # A bridge that has just started may not know any goals yet.
             self._maybe_missed.discard(name)
         if is_known and missed and presence and presence.online:
             self._events.append(EventsMissed(RobotInfo(presence, status), tuple(missed)))
