@@ -69,7 +69,7 @@ class GoalHandle(GoalCalls):
         return (each async for each in self._iterate_events(timeout, feedback=True) if isinstance(each, WordHeard))
 
     async def cancel(self) -> Goal:
-        """Cancel the goal, and wait until it has stopped. Return it."""
+        """Cancel the goal, and wait until it has stopped. Return the goal."""
         return await self._cancel()
 
     async def _iterate_events(self, timeout: float | None, *, feedback: bool) -> AsyncIterator[Event]:
@@ -85,7 +85,7 @@ class GoalHandle(GoalCalls):
 
 
 class SpeechStream(StreamCalls):
-    """A text that is spoken while it is written.
+    """Text that is spoken while it is being written.
 
     `Client.stream` creates the stream, which is a context manager. When the block ends, the text is complete. If an
     exception ends the block, the goal is ABORTED at once with the reason `broken_off`, or RECALLED if it hasn't
@@ -127,7 +127,7 @@ class Client(ClientCalls):
         )
 
     async def connect(self) -> Client:
-        """Connect to the server, unless the client is connected. Return the client.
+        """Connect to the server, unless the client is already connected. Return the client.
 
         The errors are those of the blocking client's constructor.
         """
@@ -184,7 +184,7 @@ class Client(ClientCalls):
         return await self._follow(GoalHandle, ids, feedback=feedback)
 
     async def events(self, *, reconnect: bool = False) -> AsyncIterator[Event]:
-        """Iterate over the events of all goals, from the first step of the iteration on."""
+        """Iterate over the events of all goals, starting with the first step of the iteration."""
         next_event = await self._watch(reconnect=reconnect)
         while True:
             yield await next_event()
@@ -192,7 +192,7 @@ class Client(ClientCalls):
     if not TYPE_CHECKING:  # type checkers would otherwise accept any name
 
         def __getattr__(self, name: str) -> Any:
-            """Explain that a client is not connected, if its connection is missing."""
+            """Raise UsageError if the connection is missing, or AttributeError for any other name."""
             if name == "_connection":
                 raise UsageError("this client is not connected; use it as in: async with Client() as talk")
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")

@@ -93,7 +93,7 @@ class LoopConnection(Connection):
 
     @classmethod
     async def open(cls, *arguments: Any, **options: Any) -> Self:
-        """Connect to a server, and let the event loop run the connection. Return it.
+        """Connect to a server, and let the event loop run the connection. Return the connection.
 
         The arguments and errors are those of the transport.
         """
@@ -135,7 +135,7 @@ class LoopConnection(Connection):
         return super().wait_until(done, deadline, **options)
 
     def _stop_waiting(self, exchange: Exchange) -> None:
-        """Withdraw a request if nothing of it was sent. Otherwise, ignore its answer.
+        """Withdraw a request if no part of it was sent. Otherwise, ignore its answer.
 
         A cancelled task must not break off the connection, which other tasks use, too.
         """

@@ -174,7 +174,7 @@ class ClientCalls(ConnectedClient):
         return goal_in((await self._connection.request(Resume()))[0])
 
     async def _ask(self, request: Set | Pause | Log) -> tuple[JsonObject, list[JsonObject]]:
-        """Check the options of a request, and send it. Return the reply and the items of its list."""
+        """Check the options of a request, and send it. Return the reply and the list items that came with it."""
         check(request)
         return await self._connection.request(request)
 
@@ -306,7 +306,7 @@ class Paused:
     """An asynchronous context manager that pauses all speech until its block ends. Its value is the paused goal."""
 
     def __init__(self, client: ClientCalls, seconds: float) -> None:
-        """Prepare the pause, without connecting. It ends after this number of seconds at the latest."""
+        """Prepare a pause of at most this number of seconds, without connecting."""
         self._client, self._request = client, Pause(seconds, while_connected=True)
 
     async def __aenter__(self) -> Goal | None:

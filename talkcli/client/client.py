@@ -437,7 +437,7 @@ class Client(ConnectedClient):
 
 
 class _BlockingManager:
-    """A context manager that blocks instead of suspending, like `run_blocking`."""
+    """A context manager that runs an asynchronous context manager and blocks instead of suspending."""
 
     def __init__(self, manager: Saying | Paused) -> None:
         self._manager = manager

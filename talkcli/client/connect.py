@@ -1,4 +1,4 @@
-"""Connect a client to the server. Give advice if this fails.
+"""Functions that connect a client to the server, and give advice if this fails.
 
 Connecting has two stages. In the first stage, `reach` opens a connection. A caller that already knows its request sends
 it with `send_early`, so that the server works on it while the rest of the client is imported. This stage imports next
@@ -75,7 +75,7 @@ class ConnectionAttempt:
 def reach(
     named_path: str | None, failures: tuple[tuple[str, Exception], ...] = (), only_path: str | None = None
 ) -> ConnectionAttempt:
-    """Connect to `named_path` or, without one, to the first usual path that works. Return the attempt.
+    """Connect to `named_path` or, if it is None, to the first default path that works. Return the attempt's state.
 
     `failures` are the paths that have already failed, with their errors. They are skipped. If `only_path` is given, it
     is the only path to try. Nothing is sent.
@@ -108,7 +108,7 @@ def _check_owner(connected: _socket.socket) -> None:
 def send_early(
     attempt: ConnectionAttempt, hello: JsonObject, request: JsonObject, before_request: Callable[[], None]
 ) -> ConnectionAttempt | None:
-    """Send the hello message. If the greeting comes at once, send the first request. Return the attempt.
+    """Send the hello message. If the greeting comes at once, send the first request. Return the updated attempt.
 
     The request is not sent if the greeting is late or unexpected, or if the server may lack a feature.
 

@@ -54,7 +54,7 @@ def checked_sender_name(name: str | None) -> str | None:
 def event_reader(
     connection: Connection, take: Callable[[], _T], deadline: float | None
 ) -> Callable[[], Coroutine[Any, Any, _T]]:
-    """Return a coroutine function that waits for messages until `take` returns a result, and returns it.
+    """Return a coroutine function that waits for messages until `take` returns a result, and returns this result.
 
     Its result is false if `deadline` has passed or the connection has ended. Nothing more is received after `deadline`,
     so that a loop over the results ends even if the server keeps sending events.
@@ -149,14 +149,14 @@ class Connection(ClientCore):
             self.changed.notify_all()
 
     async def open_another(self) -> Connection:
-        """Open another connection to the same server, which the server closes if the program dies. Return it.
+        """Open and return another connection to the same server, which the server closes if the program dies.
 
         Raises UsageError if there is no such connection, because a broker is in between.
         """
         raise UsageError("over a broker, paused() isn't possible; use pause(seconds=...) instead")
 
     async def request(self, request: Request, on_reply: OnReply | None = None) -> tuple[JsonObject, list[JsonObject]]:
-        """Send a request, and wait for the answer. Return the reply and the items of its list.
+        """Send a request, and wait for the answer. Return the reply and the list items that came with it.
 
         Args:
             request: the request.
@@ -227,7 +227,7 @@ class Connection(ClientCore):
             self.begin(request, on_reply, on_failure)
 
     async def until(self, done: Callable[[], bool], deadline: float | None, *, interruptible: bool = True) -> bool:
-        """Do the same as `wait_until`, for a coroutine.
+        """Do the same as `wait_until`, as a coroutine.
 
         A connection that runs in an event loop suspends the coroutine. Other connections block.
         """
@@ -423,7 +423,7 @@ class SocketConnection(Connection):
         return connection
 
     async def open_another(self) -> Connection:
-        """Open another connection to the same server, with the same name, and return it.
+        """Open and return another connection to the same server, with the same name.
 
         The errors are those of `Client`.
         """
@@ -458,7 +458,7 @@ class SocketConnection(Connection):
                 self.stop_sending(f"the connection to the server was lost: {error.strerror}")
 
     def prepare(self, now: float) -> tuple[dict[int, int], float]:
-        """Send waiting requests. Return the socket with its poll events, and when to call `process`."""
+        """Send waiting requests. Return the socket with its poll events, and when to call `process` next."""
         self._polled = self._socket
         if self._received_early:
             return {}, now
@@ -547,7 +547,7 @@ class ReconnectingConnection(SocketConnection):
             self._schedule_retry(ServerUnavailable(f"nothing was sent to the server at {self.path}: {why}"), now)
 
     def prepare(self, now: float) -> tuple[dict[int, int], float]:
-        """Reconnect if the connection is needed. Return the socket with its poll events, and when to call `process`."""
+        """Reconnect if necessary. Return the socket with its poll events, and when to call `process` next."""
         is_needed = bool(self.exchanges or self.listeners.goals or self.listeners.watches)
         if self._socket is not None and not self.greeted and now >= self._due:
             self._drop()

@@ -508,7 +508,7 @@ class ClientCore:
             self.fail(exchange, self.unanswered(exchange))
 
     def answer(self, exchange: Exchange) -> tuple[JsonObject, list[JsonObject]]:
-        """Return the reply to a request and the items of its list. Raise the error if the request failed.
+        """Return the reply to a request and the list items that came with it. Raise the error if the request failed.
 
         Raises:
             RequestRefused: the server refused the request.
@@ -572,7 +572,7 @@ class ClientCore:
         return exchange.heard_at + min(self._patience, ttl or self._patience)
 
     def silence_deadline(self, waiting_since: float) -> tuple[float, str]:
-        """Return when a silent server counts as lost, and the error message for that.
+        """Return the time at which a silent server counts as lost, and an error message.
 
         Args:
             waiting_since: when the caller started to wait (monotonic). Earlier silence doesn't count.

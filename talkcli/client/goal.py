@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class GoalCalls(TrackedGoal):
-    """The base class of goal handles. It has the calls that never wait, and coroutines for those that wait."""
+    """The base class of goal handles, with methods that never wait, and coroutines for the calls that do."""
 
     def __init__(self, connection: Connection, goal: Goal) -> None:
         super().__init__(goal)
@@ -107,7 +107,7 @@ class GoalCalls(TrackedGoal):
         return event
 
     async def _cancel(self) -> Goal:
-        """Cancel the goal, and wait until it has stopped. Return it."""
+        """Cancel the goal, and wait until it has stopped. Return the goal."""
         if not self.state.terminal:
             found = Canceled.from_items((await self._connection.request(Cancel((self.id,))))[1])
             goal = next((each for each in (*found.canceled, *found.ended) if each.id == self.id), None)
@@ -206,7 +206,7 @@ class GoalHandle(GoalCalls):
         return (each for each in self._iterate_events(end, timeout) if isinstance(each, WordHeard))
 
     def cancel(self) -> Goal:
-        """Cancel the goal, and wait until it has stopped. Return it.
+        """Cancel the goal, and wait until it has stopped. Return the goal.
 
         Raises:
             UnknownGoal: the server doesn't know the goal, for example because the server was restarted.

@@ -1,4 +1,4 @@
-"""Texts that are spoken while they are written.
+"""Text that is spoken while it is being written.
 
 `SpeechStream` sends the text and blocks while the server holds its replies back. `StreamCalls` is the part that it
 shares with the stream of the asyncio client. `growing` decides what to send.
@@ -132,7 +132,7 @@ class StreamCalls:
 
 
 class SpeechStream(StreamCalls):
-    """A text that is spoken while it is written.
+    """Text that is spoken while it is being written.
 
     `Client.stream` creates the stream.
 

@@ -131,7 +131,7 @@ def read_description(path: str) -> VoiceDescription:
 
 
 def voice_rate(voice: str) -> int:
-    """Return the sample rate of a voice. Return the rate of espeak if it isn't a neural voice or can't be read."""
+    """Return the sample rate of a neural voice. For an unreadable or other voice, return espeak's rate."""
     try:
         return read_description(find_models()[without_speaker(voice).removeprefix(NEURAL_PREFIX)]).rate
     except (KeyError, VoiceFileError):

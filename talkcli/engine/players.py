@@ -257,7 +257,7 @@ def _has_default_server(path: str) -> bool:
 
 
 def _list_directory(directory: str) -> list[str]:
-    """Return the sorted names in a directory. The list is empty if it can't be read."""
+    """Return the sorted names in a directory, or an empty list if the directory can't be read."""
     with contextlib.suppress(OSError):
         return sorted(os.listdir(directory))
     return []

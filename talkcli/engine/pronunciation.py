@@ -47,7 +47,7 @@ _WITHOUT_BRACKETS = str.maketrans("[]", "()")
 
 
 class SpokenText:
-    """A part of a text with replaced terms.
+    """A part of a text, in which terms are replaced by their pronunciations.
 
     Attributes:
         text: the text as it is said.
@@ -87,7 +87,10 @@ class SpokenText:
         self.text += text
 
     def locate(self, start: int, length: int) -> tuple[int, int]:
-        """Return the place and length in the sent text of a word of the spoken text. A replaced term is one word."""
+        """Convert a word's start and length in the spoken text to those in the sent text.
+
+        A replaced term counts as one word.
+        """
         begin, original, term_chars = self._sections[self._find_section(start)]
         if term_chars:
             return original, term_chars
@@ -96,7 +99,7 @@ class SpokenText:
         return place, original + (term_chars or last - begin + 1) - place
 
     def _find_section(self, place: int) -> int:
-        """Return the index of the section that contains an offset of the spoken text."""
+        """Return the index of the section that contains an offset in the spoken text."""
         return max(0, bisect.bisect_right(self._sections, place, key=lambda each: each[0]) - 1)
 
 
@@ -141,7 +144,7 @@ class Pronunciations:
                     break
 
     def say(self, text: str, text_format: str) -> str | None:
-        """Return a goal's text as it is said, for people to read. Return None if it is said as it was sent."""
+        """Return a readable form of a goal's text as it is spoken, or None if the text is spoken as it was sent."""
         if text_format == MARKDOWN:
             from talkcli.engine.markdown import blank_markdown  # this import is slow and rarely needed
 

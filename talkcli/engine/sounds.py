@@ -61,7 +61,7 @@ class SoundError(Exception):
 
 @frozen
 class SoundFile:
-    """An open WAV file, and the form of its samples."""
+    """An open WAV file, and the format of its samples."""
 
     descriptor: int
     path: str
@@ -74,7 +74,7 @@ class SoundFile:
 
 
 class SoundLibrary:
-    """The sounds that a server can play by their names."""
+    """The sounds that a server can play, by name."""
 
     def __init__(self, directory: str | None) -> None:
         """Create a library of the built-in sounds and, optionally, the files in a directory."""
@@ -86,7 +86,7 @@ class SoundLibrary:
         return sorted(BUILT_IN.keys() | {name for name, file in files if _is_wav(file) and name.isprintable()})
 
     def refusal(self, name: str) -> Refusal | None:
-        """Return the reason why a sound can't be played. Return None if it can."""
+        """Return the reason why a sound can't be played, or None if it can be played."""
         try:
             file = self.open(name)
         except SoundError as error:
@@ -109,7 +109,7 @@ class SoundLibrary:
         return self._open_file(file_name)
 
     def _files(self) -> dict[str, str]:
-        """Return the files in the directory by the names of their sounds. There are none if it can't be read.
+        """Return the directory's files by sound name. The result is empty if the directory can't be read.
 
         NAME.wav is preferred. Other files are listed, too, so that an error message can say what they are.
         """
@@ -139,7 +139,7 @@ class SoundLibrary:
             raise SoundError(Reason.BAD_SOUND, f"{path} can't be read: {error.strerror}") from error
 
     def _unknown_message(self, name: str) -> str:
-        """Return the error message for a sound that doesn't exist. If the name is a path, it says what to do."""
+        """Return the error message for an unknown sound. For a path, the message says how to play the file."""
         shown, names = repr(name[:_SHOWN_NAME_CHARS]), self.names()
         base = os.path.splitext(os.path.basename(name))[0]
         if base and base != name:
@@ -161,7 +161,7 @@ def _refuse(path: str, words: str) -> NoReturn:
 
 
 def _refuse_format(path: str, words: str) -> NoReturn:
-    """Raise SoundError for a file in another format. The message names a command that converts it."""
+    """Raise SoundError for a file in another format. The message names a command that converts the file."""
     source, target = shlex.quote(path), shlex.quote(f"{os.path.splitext(path)[0]}.wav")
     command = f"ffmpeg -i {source} -ac 1 -ar 44100 "
     command += f"new.wav && mv new.wav {target}" if source == target else target

@@ -59,7 +59,7 @@ class Handler(Protocol):
     greeting: bytes
 
     def joined(self, connection: ClientConnection) -> None:
-        """Admit a new client, let it wait because the server is full, or refuse it."""
+        """Admit a new client, make it wait for room, or refuse it."""
 
     def left(self, connection: ClientConnection) -> None:
         """Remove a client that has disconnected."""
@@ -243,7 +243,7 @@ class ClientConnection(asyncio.Protocol):
     # -- called by the stream
 
     def connection_lost(self, error: Exception | None) -> None:
-        """Process the last requests of a disconnected client, and remove it from the server."""
+        """Process the last requests of a disconnected client, and remove the client from the server."""
         self._first_timer.cancel()
         self._cancel_line_timer()
         if error is not None and self.admitted:
@@ -301,7 +301,7 @@ class ClientConnection(asyncio.Protocol):
         self._schedule_work()
 
     def publish(self, event: bytes, *, feedback: bool = False) -> None:
-        """Send an encoded event. If it is feedback and the client reads too slowly, hold it back.
+        """Send an encoded event. If the client reads too slowly, hold back feedback.
 
         Only the newest feedback is kept, and older feedback is dropped.
         """

@@ -1,4 +1,4 @@
-"""The server's history: stores the goals that have ended, and searches them for clients.
+"""The server's history, which stores ended goals and lets clients search them.
 
 The methods run in the event loop's thread and never wait for the disk. One thread writes the goals, and another one
 searches, so that a slow search doesn't delay writing. Goals that have not been written yet are kept in memory, for
@@ -62,7 +62,7 @@ class _Worker:
             raise TalkError(f"can't start the history's threads: {memory_hint()}") from error
 
     def _run(self) -> None:
-        """Run the functions."""
+        """Run the queued functions until None ends the thread."""
         while function := self.functions.get():
             function()
 

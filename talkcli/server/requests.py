@@ -1,4 +1,4 @@
-"""Handles the requests of clients, with one coroutine for each kind of request.
+"""The handler of clients' requests, which has one coroutine for each kind of request.
 
 A coroutine may wait for the list of voices, for room in the queue, or for silence. Meanwhile, the client's connection
 stays open. If the client disconnects, its requests are dropped.
@@ -109,7 +109,7 @@ class Requests:
         self._speech.notifications.add(notifications)
 
     async def _carry_out(self, pending: PendingRequest) -> None:
-        """Carry out a request, if necessary after the voices are listed. Reply with any error."""
+        """Carry out a request. If necessary, wait for the list of voices first. Reply with any error."""
         request = pending.request
         try:
             if isinstance(request, Cancel | Pause):
@@ -145,12 +145,12 @@ class Requests:
         return self._speech.awaits_voices and (names_voice or isinstance(request, Voices))
 
     def _stop_awaiting_voices(self, connection: ClientConnection) -> None:
-        """Continue a connection's requests that wait for the list of voices, without the list."""
+        """Let a connection's requests continue without the list of voices for which they wait."""
         for each in self._awaiting_voices(connection):
             each.resume()
 
     def _reserve_memory(self, pending: PendingRequest) -> bool:
-        """Reserve memory for a waiting request. If too many wait, set its refusal and return False.
+        """Reserve memory for a waiting request. If too many requests wait, set its refusal and return False.
 
         In this case, the request is carried out without waiting, and the refusal rejects its goal.
         """

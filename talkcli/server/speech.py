@@ -1,4 +1,4 @@
-"""Connects the scheduler with the engine.
+"""The connection between the scheduler and the engine.
 
 Everything runs in the event loop's thread and never blocks. The scheduler makes the decisions, the engine thread
 speaks, and `subscribers` publishes the events. A timer in this module calls the scheduler's `tick` at its `deadline`.
@@ -224,7 +224,7 @@ class Speech:
                 log.write(log.sanitize(message))
 
     def _give_order(self, record: Record, order: Order) -> None:
-        """Give the engine an order about a goal."""
+        """Tell the engine to start, change, pause or end a goal, as ordered by the scheduler."""
         match order:
             case Order.START:
                 self._start_speaking(record)
@@ -242,7 +242,7 @@ class Speech:
                 self.engine.resume(record.id)
 
     def _start_speaking(self, record: Record) -> None:
-        """Tell the engine to speak a goal, or the rest of an interrupted one. If its voice is unavailable, fail it.
+        """Tell the engine to speak a goal or its rest. If the goal's voice is unavailable, fail the goal.
 
         The rest has the same voice and settings.
         """
@@ -277,11 +277,11 @@ class Speech:
         self.engine.speak(command)
 
     def _current_pronunciations(self) -> dict[str, str]:
-        """Return the terms to replace in goals that start now."""
+        """Return the current terms and their replacements, which apply to goals that start now."""
         return self.pronunciation_file.refresh().terms if self.pronunciation_file else {}
 
     def describe_goal(self, record: Record) -> Goal:
-        """Return a copy of a goal that also has the text as it is said, or would be said if it started now."""
+        """Return a copy of a goal. The copy also has the text as it is spoken, or would be spoken now."""
         goal, terms = record.snapshot(), record.pronunciations
         if terms is None and goal.state is State.PENDING:
             terms = self._current_pronunciations()

@@ -1,4 +1,4 @@
-"""Accepts clients' connections, and reads and writes their sockets, in the event loop's thread.
+"""Code that accepts clients' connections, and reads and writes their sockets, in the event loop's thread.
 
 Streams replace asyncio's transports and have a similar interface. There are three reasons for this:
 
@@ -172,7 +172,7 @@ class ClientStream:
         return len(self._unread)
 
     def adjust_held_bytes(self, added_bytes: int) -> None:
-        """Change the size of the receiver's held output. Disconnect slow clients above the total limit."""
+        """Change the size of the receiver's held output. If the total exceeds the limit, disconnect slow clients."""
         if self in self._streams.open:
             self.held_bytes += added_bytes
             self._streams.unread_bytes += added_bytes

@@ -1,4 +1,4 @@
-"""Sends events and keep-alive messages to subscribed clients.
+"""Code that sends events and keep-alive messages to subscribed clients.
 
 A cancel may end thousands of goals. Therefore, events are sent no faster than clients read them.
 """
@@ -148,7 +148,7 @@ class Subscribers:
             self._alive_timer = self._loop.call_later(CLIENT_ALIVE_INTERVAL_S, self._send_alive)
 
     def _feedback_receivers(self, waiters: Iterable[dict[ClientConnection, bool]]) -> dict[ClientConnection, None]:
-        """Return all watching connections, and those among the waiters that want feedback."""
+        """Return all watching connections, and the waiting connections that want feedback."""
         listeners = dict(self._watchers)
         for each in waiters:
             listeners.update((connection, None) for connection, feedback in each.items() if feedback)

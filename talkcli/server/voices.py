@@ -1,4 +1,4 @@
-"""Finds the voice that a client asks for.
+"""Code that finds the voice that a client asks for.
 
 `goals.voices` decides when voices are loaded.
 
@@ -76,7 +76,7 @@ class VoiceCatalog:
 
     @property
     def _driver_voices(self) -> tuple[Voice, ...]:
-        """The voices that the engine has listed, without neural ones."""
+        """The voices listed by the engine, except neural voices."""
         return tuple(each for each in self.listed or () if not is_neural(each.id))
 
     def _candidates(self, voice: str) -> tuple[Voice, ...]:

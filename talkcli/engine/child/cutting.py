@@ -168,7 +168,7 @@ class GrowingText:
         return float("inf")
 
     def _find_part_end(self, now: float, silent_at: float) -> int | None:
-        """Skip blanks before the next part. Return its end, or None if it can't be spoken yet.
+        """Skip blanks before the next part. Return the part's end, or None if the part can't be spoken yet.
 
         Args:
             now: the current time.
@@ -198,7 +198,7 @@ class GrowingText:
         return _find_word_gap(text, start, longest) if waited == _LONG_WAIT else None
 
     def _find_sentence_end(self, waited: int) -> int | None:
-        """Return the end of the next sentence that counts as complete after this wait, if any.
+        """Return the end of the next sentence, or None if no sentence counts as complete after this wait.
 
         `waited` says how long the text has stayed the same. It is one of the constants such as `_SHORT_WAIT`.
         """

@@ -147,7 +147,7 @@ def _available_drivers() -> list[str]:
 
 
 def _make_run_loop_step(driver_name: str) -> Callable[[], None]:
-    """Return a function that runs macOS's event loop once, or does nothing for other drivers."""
+    """Return a function that runs macOS's event loop once if the driver needs it, and otherwise does nothing."""
     if sys.platform != "darwin" or driver_name not in _RUN_LOOP_DRIVERS:
         return lambda: None
     from Foundation import NSDate, NSRunLoop  # type: ignore[import-not-found,unused-ignore]
@@ -278,7 +278,7 @@ class Driver:
         self._playback: Playback | None = None
 
     def iterate(self) -> Iterator[None]:
-        """Speak the texts that were passed to `say`. Yield whenever all of them are spoken."""
+        """Speak the texts that were passed to `say`. Yield whenever no text is left."""
         while True:
             if self._text is None:
                 self._proxy.setBusy(False)  # pyttsx3 sends no text while the driver is busy

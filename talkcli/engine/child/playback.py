@@ -146,7 +146,7 @@ class SentenceSamples:
 
 
 class PlayerFeed:
-    """Sends samples to one player, and keeps the word clock in step with it."""
+    """Sends samples to one player, and keeps the word clock in step with the player."""
 
     def __init__(self, player: Player, rate: int, clock: WordClock, begin: float, lead_in: float) -> None:
         """Start a stream, and reset the word clock.
@@ -337,7 +337,7 @@ class Playback:
         self.begin(rate, "")
 
     def word(self, start: int, length: int, audio_start: float) -> None:
-        """Schedule a word to be reported when it is heard, if it is a new word.
+        """If a word is new, schedule it to be reported when it is heard.
 
         Args:
             start: offset of the word in the current part of the text, as it is said.
@@ -350,7 +350,7 @@ class Playback:
             self._clock.add(TimedWord(*found, self._seconds(self._part_begin) + audio_start))
 
     def write(self, samples: bytes) -> None:
-        """Send samples to the player, except silence at the end. Wait until it has accepted them.
+        """Send samples to the player, except silence at the end. Wait until the player has accepted them.
 
         If all samples so far are silent, they are stored until the first sound follows.
         """
@@ -482,7 +482,7 @@ class Playback:
         return PlayerFeed(player, self._rate, self._clock, self._seconds(self._begin), lead_in)
 
     def _release_failed_player(self, error: CannotSpeak) -> None:
-        """Release the failed player, so that another can replace it. Raise an error if none can.
+        """Release the failed player, so that another one can replace it. Raise an error if there is no replacement.
 
         There is no replacement if some of the sound may have been heard, or if no other player is left.
         """
@@ -525,7 +525,7 @@ class Playback:
     # -- steps
 
     def _send_all(self, feed: PlayerFeed) -> None:
-        """Send all samples to the player except silence at the end. Wait until it has accepted them.
+        """Send all samples to the player except silence at the end. Wait until the player has accepted them.
 
         Play silence during a pause.
         """
@@ -788,7 +788,7 @@ class Playback:
             self._end_early(self._runner.word_end_due - time.monotonic())
 
     def _end_early(self, time_left: float) -> None:
-        """End the samples where the next word begins, and raise EndedEarly.
+        """Cut off the samples where the next word begins, and raise EndedEarly.
 
         Do nothing if the next word isn't known yet, or if it begins too late. `time_left` is the time in seconds in
         which the current word must end. After that, the word is cut off.

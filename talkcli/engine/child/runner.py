@@ -309,7 +309,7 @@ class GoalRunner:
             self._engine.stop()
 
     def _stop_goal(self) -> None:
-        """Stop the driver if it is speaking the current goal. Otherwise, end the goal as stopped."""
+        """Stop the driver if it is speaking the current goal. Otherwise, end the goal at once."""
         if self._goal is not None and not self._goal.stop_requested:
             self._goal.stop_requested = True
             if self._goal.with_driver:
@@ -340,7 +340,7 @@ class GoalRunner:
 
     @property
     def text_start(self) -> int:
-        """Offset at which the speech of the current goal begins, if it was interrupted before."""
+        """The offset in the text at which the current goal continues after an interruption, or 0."""
         return self._goal.command.start if self._goal else 0
 
     @property

@@ -1,4 +1,4 @@
-"""Plays sounds. A sound takes the place of a synthesizer, and writes its samples to a `Playback`.
+"""Code that plays sounds. Their samples are written to a `Playback`, like those of a synthesizer.
 
 All work is done in small pieces, so that a sound can be stopped and paused, and a long file needs little memory.
 """
@@ -37,7 +37,7 @@ _ATTACK_S = 0.008
 
 
 def play_sound(library: SoundLibrary, command: Speak, playback: Playback, required_rate: int | None) -> float:
-    """Play a sound, except for its end, which `Playback.finish` plays. Return its length in seconds.
+    """Play a sound, except for its end, which `Playback.finish` plays. Return the sound's length in seconds.
 
     Args:
         library: the sounds.
@@ -111,7 +111,7 @@ def _decode(data: bytes, file: SoundFile) -> array[int]:
 
 
 def resample(pieces: Iterable[array[int]], rate: int, new_rate: int) -> Iterator[array[int]]:
-    """Yield the samples with another sample rate.
+    """Convert samples to another sample rate, and yield them in pieces.
 
     If the new rate is much lower, the averages of several samples are used. They don't contain frequencies that the new
     rate can't represent. The remaining difference is made up by linear interpolation.

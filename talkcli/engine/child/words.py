@@ -69,7 +69,7 @@ class WordFinder:
         return start, self._end, self._count
 
     def _whole_end(self, start: int, end: int) -> int:
-        """Return the end of a word, given the part of it that the synthesizer reported."""
+        """Return the end of a whole word, given the part of the word that the synthesizer reported."""
         text = self.text
         if end == len(text) or text[end].isspace():
             return start + len(text[start:end].rstrip(_END_MARKS) or text[start:end])
@@ -120,7 +120,7 @@ class WordClock:
         self._waiting = deque(each for each in self._waiting if each.position < position)
 
     def delay_words_until(self, position: float) -> None:
-        """Let no word begin before this position in the audio."""
+        """Move all words that begin before this position in the audio to this position."""
         self._waiting = deque(replace(each, position=max(position, each.position)) for each in self._waiting)
 
     def reset(self, position: float) -> None:

@@ -141,7 +141,7 @@ class EngineProcess:
             yield event
 
     def read_stderr(self) -> bool:
-        """Pass new lines of standard error to `on_stderr_line`. Return whether it is still open."""
+        """Pass new lines of standard error to `on_stderr_line`. Return whether standard error is still open."""
         try:
             data = os.read(self.stderr, 65536)
         except BlockingIOError:

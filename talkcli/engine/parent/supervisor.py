@@ -90,7 +90,7 @@ class ActionQueue:
         return self._receiver.fileno()
 
     def call(self, action: Callable[[], object]) -> None:
-        """Queue an action to run in the engine thread. After `close`, it never runs."""
+        """Queue an action to run in the engine thread. Actions queued after `close` never run."""
         self._actions.append(action)
         with contextlib.suppress(OSError):  # the queue is closed, or its buffer is full
             self._sender.send(b"\0")
@@ -485,7 +485,7 @@ class Supervisor:
         self._watched |= dict.fromkeys((process.socket.fileno(), process.liveness, process.stderr), process)
 
     def _report_stderr(self, line: str) -> None:
-        """Post a line of a process's standard error. Drop it if there have been too many lines."""
+        """Post a line of a process's standard error, unless there have been too many lines."""
         omitted = self._stderr_quota.count_event(time.monotonic())
         if omitted:
             self._post(EngineSaid(f"({omitted} lines were omitted)"))
@@ -594,7 +594,7 @@ class Supervisor:
             self._post(EngineMissing(message))
 
     def _release_process(self, process: EngineProcess) -> None:
-        """Close the descriptors of a process that has exited. End its goal unless it is retried."""
+        """Close the descriptors of a process that has exited. End the goal that was waiting for the exit, if any."""
         del self._watched[process.liveness]
         if self._watched.pop(process.stderr, None):
             process.read_stderr()
@@ -616,5 +616,5 @@ class Supervisor:
 
 
 def _interrupted_before_start(goal: SupervisedGoal) -> protocol.Ended:
-    """Return the end of a goal that was interrupted before any of it was heard."""
+    """Return the `Ended` event of a goal that was interrupted before any of it was heard."""
     return protocol.Ended(goal.command.id, protocol.OUTCOME_INTERRUPTED, rest=goal.command.start)

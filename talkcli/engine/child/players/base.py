@@ -146,7 +146,7 @@ class Player(Protocol):
         """
 
     def wake_at(self) -> float:
-        """Return when to call the player again, or NEVER if polling its descriptors is enough.
+        """Return when to call the player again, or NEVER if its descriptors report everything.
 
         The result is a time of the monotonic clock.
         """

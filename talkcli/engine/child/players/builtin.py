@@ -214,7 +214,7 @@ class WavStreamPlayer(BuiltInPlayer):
         return [(self._output, select.POLLOUT)]
 
     def wake_at(self) -> float:
-        """Return NEVER, because polling the output is enough."""
+        """Return NEVER, because the output's descriptor reports when there is room."""
         return NEVER
 
 
@@ -244,7 +244,7 @@ def _open_regular_file(path: str) -> int:
 
 
 def saved_rate(path: str) -> int | None:
-    """Return the sample rate of a WAV file written by `WavPlayer`. Return None if there is none."""
+    """Return the sample rate of a WAV file written by `WavPlayer`, or None if there is no such file."""
     try:
         file = _open_regular_file(path)
     except (CannotSpeak, OSError):
@@ -262,7 +262,7 @@ def _header_fields(rate: int, sample_bytes: int) -> tuple[bytes | int, ...]:
 
 
 def _sample_byte_count(file: int, path: str, rate: int) -> int:
-    """Check the WAV header of a file. Return the number of sample bytes that it states.
+    """Check the WAV header of a file. Return the number of sample bytes that the header states.
 
     Raises:
         CannotSpeak: The file wasn't written by a `WavPlayer` with this sample rate.

@@ -81,7 +81,7 @@ class HandoverTimes:
         self._previous = (player_name, last_sample_at) if self.next_waits else None
 
     def sentence_started(self, player_name: str, at: float, *, neural: bool = False) -> None:
-        """Record the delay since the previous sentence, if this one was already waiting."""
+        """Record the delay since the previous sentence, if the new sentence was already waiting."""
         previous, self._previous = self._previous, None
         if previous is not None and previous[0] == player_name and 0 < at - previous[1] < MAX_HANDOVER_S:
             self._measured.setdefault((player_name, neural), deque(maxlen=MAX_HANDOVERS)).append(at - previous[1])
@@ -146,7 +146,7 @@ class PlayerChooser:
         self.handovers.next_waits, self.handovers.next_is_neural = command.next_waits, command.next_is_neural
 
     def required_rate(self, voice: str | None) -> int | None:
-        """Return the sample rate that a sound must have. Return None if the player can play any rate.
+        """Return the sample rate that a sound must have, or None if the player can play any rate.
 
         All samples in a WAV file have the same rate. A new file gets the rate of this voice.
         """

@@ -114,7 +114,7 @@ class PlayerProcess:
             self.exit = io.FileIO(os.pidfd_open(self.pid))
 
     def poll(self) -> int | None:
-        """Return the exit status, or None while the program runs. Kill processes that it left behind.
+        """Return the exit status, or None while the program runs. Kill processes that the program has left behind.
 
         This also reaps the program. If a signal killed it, the status is the negative number of the signal. The program
         counts as running until all processes that it has started have exited.
@@ -307,7 +307,7 @@ class ProgramPlayer(Player):
         return [(file.fileno(), events) for file, events in wanted if file is not None and not file.closed]
 
     def wake_at(self) -> float:
-        """Return the time of the next check for the program's exit, or NEVER if polling is enough."""
+        """Return when to check whether the program has exited, or NEVER if a descriptor reports the exit."""
         return time.monotonic() + EXIT_CHECK_S if self._process.exit is None else self._exit_due
 
     def kill(self) -> None:

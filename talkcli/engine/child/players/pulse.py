@@ -386,7 +386,7 @@ class PulsePlayer(Player):
             self._time_request_at = now + TIME_REQUEST_S
 
     def _on_drained(self, _stream: int, success: int, _data: object) -> None:
-        """Record that the server has played the whole stream, or that it has failed to do so."""
+        """Record that the server has played the whole stream, or has failed to do so."""
         if not success:
             self._record_failure()
             return

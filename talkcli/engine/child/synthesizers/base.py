@@ -67,7 +67,7 @@ class SampleSink(Protocol):
         """
 
     def write(self, samples: bytes) -> None:
-        """Play these samples. A call with `b""` only raises Stopped if the sentence has to end."""
+        """Play these samples. Raise Stopped if the sentence has to end, even if there are no samples."""
 
     def wait(self, descriptor: int) -> None:
         """Keep playing until a file descriptor becomes readable.

@@ -54,7 +54,7 @@ _MAX_NAME_BYTES = 1000
 
 
 class NotSplit(Exception):
-    """Raised if a model is unsafe or isn't one of Piper's.
+    """Raised if a model is unsafe or isn't a Piper model.
 
     The message gives the reason without the file's name.
     """
