@@ -81,7 +81,7 @@ class ClientCalls(ConnectedClient):
         before: str | None = None,
         key: str | None = None,
     ) -> Canceled:
-        """Cancel goals, and wait until they have stopped. Return the cancelled and the already ended goals."""
+        """Cancel goals, and wait until they have stopped. Return these goals, and those that had already ended."""
         wanted = None if ids is None else [self._full_id(each) for each in ids]
         first, *others = [None] if wanted is None else batches(wanted) or [()]
         last = None if before is None else self._full_id(before)
@@ -129,7 +129,7 @@ class ClientCalls(ConnectedClient):
         return list(goals((await self._ask(request))[1], "goal"))
 
     async def dry_run(self, text: str, **options: Any) -> Goal:
-        """Check a text without speaking it. Return its goal as it would be accepted or REJECTED."""
+        """Check a text without speaking it. Return the accepted or REJECTED goal."""
         request = Say(text, dry_run=True, **options)
         check(request)
         if rejected := too_long(request):

@@ -155,7 +155,7 @@ class Client(ConnectedClient):
         return run_blocking(self._calls._say(GoalHandle, **given))
 
     def dry_run(self, text: str, **options: Any) -> Goal:
-        """Check a text without speaking it. Return its goal as it would be accepted or REJECTED.
+        """Check a text without speaking it. Return the accepted or REJECTED goal.
 
         The goal has no id. Its `said` is the text as it would be said, or None if it would be said as it is. The
         options are those of `say` that describe the goal.
@@ -266,7 +266,7 @@ class Client(ConnectedClient):
         before: str | None = None,
         key: str | None = None,
     ) -> Canceled:
-        """Cancel goals, and wait until they have stopped. Return the cancelled and the already ended goals.
+        """Cancel goals, and wait until they have stopped. Return these goals, and those that had already ended.
 
         Without arguments, cancel all goals. A goal is cancelled if any of the arguments selects it.
 

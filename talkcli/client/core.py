@@ -625,7 +625,7 @@ class ClientCore:
         return self._splitter.feed(data)
 
     def begin_stream(self) -> None:
-        """Prepare for a new stream of bytes. Discard the incomplete line of the previous one."""
+        """Prepare for a new stream of bytes. Discard the incomplete line of the previous stream."""
         self._splitter = LineSplitter()
 
     def receive(self, data: bytes, now: float) -> None:

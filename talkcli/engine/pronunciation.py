@@ -214,7 +214,7 @@ class PronunciationFile:
         return self._table
 
     def _read(self) -> None:
-        """Read the file if it has changed. This never waits for a pipe or a device.
+        """Read the file if it has changed, without waiting for a pipe or a device.
 
         Raises:
             OSError, ValueError: the file can't be read.

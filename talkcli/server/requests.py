@@ -150,7 +150,7 @@ class Requests:
             each.resume()
 
     def _reserve_memory(self, pending: PendingRequest) -> bool:
-        """Reserve memory for a waiting request. If too many requests wait, set its refusal and return False.
+        """Reserve memory for a waiting request. If too many requests wait, store the refusal and return False.
 
         In this case, the request is carried out without waiting, and the refusal rejects its goal.
         """
@@ -289,7 +289,7 @@ class Requests:
         pending.answer(length=len(record.say.text), state=record.state.name)
 
     def _require_producer(self, record: Record, connection: ClientConnection) -> None:
-        """Make a connection the only one that adds text to a goal. Raise RequestRefused if another does.
+        """Let only this connection add text to a goal. Raise RequestRefused if another connection already does.
 
         A new connection may continue a text if the old one is gone and the sender chose the goal's id.
         """
@@ -305,7 +305,7 @@ class Requests:
         return producer is None or producer.detect_hang_up()
 
     def _check_goal(self, pending: PendingRequest, say: Say) -> tuple[Say, Refusal | None]:
-        """Look up a goal's voice. Return the goal with the voice's id, and any reason to reject it.
+        """Look up a goal's voice. Return the goal with the voice's id, and any reason to reject the goal.
 
         Refusals that need a clock, files or other I/O belong here. The scheduler decides about all others.
         """

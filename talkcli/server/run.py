@@ -223,7 +223,7 @@ class Server:
         self.speech.history = History(path, with_text=with_text)
 
     def _apply_configured_voice(self) -> str | None:
-        """Apply the configured voice if it is neural. Otherwise, return it for the engine to check.
+        """Apply the configured voice if it is neural. Otherwise, return the voice for the engine to check.
 
         A neural voice is loaded later, so that it doesn't delay speech.
 

@@ -302,7 +302,7 @@ class Speech:
         return following is not None, following is not None and is_neural(self.scheduler.wanted_voice(following))
 
     def _publish_change(self, record: Record, state: State, at: float) -> None:
-        """Publish a goal's new state. If it has ended, log it and resume the requests that wait for it."""
+        """Publish a goal's new state. If the goal has ended, log the end and resume the requests that wait for it."""
         self.subscribers.state_changed(record, state, at)
         if state.terminal:
             if self.history:

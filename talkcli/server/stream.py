@@ -271,7 +271,7 @@ class ClientStream:
 
 
 def raise_descriptor_limit(clients: int) -> int:
-    """Raise the limit of open files for this many clients, as far as allowed. Return the limit."""
+    """Raise the limit of open files for this many clients, as far as the system allows. Return the limit."""
     wanted = clients + RESERVED_DESCRIPTORS + OWN_DESCRIPTORS
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     allowed, most = (2**31 if each == resource.RLIM_INFINITY else each for each in limits)

@@ -91,7 +91,7 @@ class Subscribers:
             waiting.pop(connection, None)
 
     def state_changed(self, record: Record, state: State, at: float) -> None:
-        """Publish a goal's new state. If it has ended, send the result and end its subscriptions."""
+        """Publish a goal's new state. If the goal has ended, send the result and end its subscriptions."""
         event = StateChanged(record.id, state, at, next(self._numbers))
         if self._watchers:
             # The first and the last event of a goal contain the whole goal.
@@ -130,7 +130,7 @@ class Subscribers:
         _publish(event.to_json(), self._feedback_receivers([self._waiters.get(goal_id, {})]))
 
     def interrupted(self, goal_id: str, interrupted_by: str, at: float) -> None:
-        """Tell all clients that watch or wait for a goal which other goal interrupts it."""
+        """Tell the clients that watch or wait for a goal about the goal that interrupts it."""
         event = GoalInterrupted(goal_id, By(goal=interrupted_by), at, next(self._numbers))
         _publish(event.to_json(), dict.fromkeys(chain(self._watchers, self._waiters.get(goal_id, ()))))
 
@@ -143,7 +143,7 @@ class Subscribers:
         _publish(event.to_json(), self._feedback_receivers(self._waiters.values()))
 
     def schedule_keep_alive(self) -> None:
-        """Schedule the next keep-alive messages, unless they are scheduled already."""
+        """Schedule the next keep-alive messages, unless they are already scheduled."""
         if self._alive_timer is None:
             self._alive_timer = self._loop.call_later(CLIENT_ALIVE_INTERVAL_S, self._send_alive)
 

@@ -133,7 +133,7 @@ class GrowingText:
         self.text, self.position, self.ended = self.text[: self.position], position, True
 
     def take_next_part(self, now: float, buffered_s: float) -> tuple[int, int] | None:
-        """Take the next part that can be spoken now. Return its start and end, or None.
+        """Take the next part that can be spoken now. Return the part's start and end, or None.
 
         If the text is complete, the rest of it is one part. Blanks between parts are skipped.
 
@@ -151,7 +151,7 @@ class GrowingText:
         return start, end
 
     def skip_to(self, end: int) -> None:
-        """Extend the last part to an offset, so that the next part begins there."""
+        """Extend the last part up to an offset, where the next part will begin."""
         self.position = max(self.position, end)
 
     def next_part_at(self, now: float, buffered_s: float) -> float:

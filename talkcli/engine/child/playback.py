@@ -38,8 +38,8 @@ PROGRESS_CHECK_INTERVAL_S = 0.1
 #: Time allowed for a player to exit after the end of the audio. It covers the same delays as `STALL_LIMIT_S`.
 DRAIN_LIMIT_S = 3.0
 
-#: How much earlier than calculated a player may finish. Sound cards have inexact clocks, and players cut off silence at
-#: the end. The silence at the end of a sentence is longer than this, so nothing audible is missing.
+#: How long before the calculated time a player may finish. Sound cards have inexact clocks, and players cut off silence
+#: at the end. The silence at the end of a sentence is longer than this, so nothing audible is missing.
 EARLY_END_LIMIT_S = 0.25
 
 #: How long to keep trying to open a busy device. Another program, such as `talk doctor --silent`, may be using it only
@@ -332,7 +332,7 @@ class Playback:
                 self._untried = self._first_error = None
 
     def begin_sound(self, rate: int) -> None:
-        """Begin a sound instead of speech. It is played from its first sample, even if it is silent."""
+        """Begin a sound instead of speech. Silence at the beginning of the sound is not skipped."""
         self._samples.audible = self._start_known = True
         self.begin(rate, "")
 

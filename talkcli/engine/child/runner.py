@@ -137,7 +137,7 @@ class ActiveGoal:
         self.overdue_logged = False
 
     def append(self, command: protocol.Append, now: float) -> None:
-        """Add the text of an `Append` command. If it is the last, mark the goal's text as complete."""
+        """Add the text of an `Append` command, and record whether the goal's text is now complete."""
         assert self.growing_text
         self.length += len(command.text)
         text = self._remove_markdown(command.text, ended=command.end)
@@ -350,13 +350,13 @@ class GoalRunner:
 
     @property
     def sound(self) -> protocol.Speak | None:
-        """The command of the current goal if it is a sound, otherwise None."""
+        """The current goal's command if the goal is a sound, otherwise None."""
         command = self._goal.command if self._goal else None
         return command if command and command.format == SOUND else None
 
     @property
     def growing_text(self) -> GrowingText | None:
-        """The text of the current goal, or None if it doesn't grow."""
+        """The text of the current goal, or None if the text doesn't grow."""
         return self._goal.growing_text if self._goal else None
 
     def report_text_missing(self, missing: bool) -> None:

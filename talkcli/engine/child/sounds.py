@@ -28,7 +28,7 @@ _PIECE_S = 0.05
 #: Silence after a sound, as after a sentence. It is longer than `EARLY_END_LIMIT_S`, so a player that ends too early
 #: can't cut off anything audible.
 _PAUSE_S = 0.26
-#: Loudness of the built-in sounds, which is about that of speech.
+#: Level of the built-in sounds, which are about as loud as speech.
 _TONE_LEVEL = 11_000
 #: Volume of the octave that is mixed into a tone, to make the tone audible on small loudspeakers.
 _OCTAVE_LEVEL = 0.3

@@ -41,7 +41,7 @@ class WordFinder:
     """
 
     def __init__(self, text: str, end: int = 0, count: int = 0) -> None:
-        """Begin with the words after `end`. `count` words have been found before."""
+        """Start at the offset `end`, before which `count` words have been found."""
         #: the text, which may grow at the end
         self.text = text
         self._end = end

@@ -50,7 +50,7 @@ _BLANK = re.compile(r"\s+")
 
 
 class RenderFailed(TalkError):
-    """The text was not rendered, and no file was created.
+    """Raised if the text was not rendered. No file was created.
 
     `code` is a goal's reason or "cannot_write".
     """
@@ -62,7 +62,7 @@ class RenderFailed(TalkError):
 
 
 class CannotWrite(RenderFailed):
-    """The file can't be written. If it exists, it is unchanged."""
+    """Raised if the file can't be written. An existing file is unchanged."""
 
     def __init__(self, path: str, problem: str) -> None:
         super().__init__("cannot_write", f"{path} {problem}")

@@ -234,11 +234,11 @@ class Supervisor:
         self._actions.call(lambda: self._append_text(goal_id, text, complete=complete, broke_off=broke_off))
 
     def stop(self, goal_id: str) -> None:
-        """Stop the goal. Its `Ended` is posted once it has stopped."""
+        """Stop the goal. Its `Ended` event is posted once the goal has stopped."""
         self._actions.call(lambda: self._stop_goal(goal_id))
 
     def interrupt(self, goal_id: str) -> None:
-        """End the goal at the end of the current word. Its `Ended` is posted at that time.
+        """End the goal at the end of the current word. Its `Ended` event is posted at that time.
 
         If no word follows, the goal ends as usual.
         """

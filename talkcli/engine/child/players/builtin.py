@@ -117,7 +117,7 @@ class NullPlayer(BuiltInPlayer):
 
 
 class WavPlayer(BuiltInPlayer):
-    """Appends one sentence to a WAV file.
+    """Appends the sound of one sentence to a WAV file.
 
     The file is valid after every sentence, even if the sentence was stopped. The player only appends to files with the
     plain 44-byte header that it writes itself. It removes samples beyond the length in the header, which a crash may
@@ -178,7 +178,7 @@ class WavPlayer(BuiltInPlayer):
 
 
 class WavStreamPlayer(BuiltInPlayer):
-    """Writes a sentence to a WAV stream: a pipe, a device, or a file that the shell has opened.
+    """Writes the sound of a sentence to a WAV stream: a pipe, a device, or a file opened by the shell.
 
     The stream contains all sentences. Its header has no valid lengths, because it can't be rewritten later. The program
     that reads the stream sets the pace. Other programs share the descriptor, so this player doesn't make it

@@ -185,7 +185,7 @@ class PlayerChooser:
         return milliseconds / 1000 if due else 0.0
 
     def find_first_player(self) -> str | None:
-        """Find out which player the next sentence would use. Return its name, or None.
+        """Find the player that the next sentence would use. Return the player's name, or None.
 
         Players that run in this process are opened and closed to test them.
         """

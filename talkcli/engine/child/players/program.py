@@ -231,7 +231,7 @@ class ErrorOutput:
 
 
 class ProgramPlayer(Player):
-    """Plays a sentence by writing it to the standard input of a program."""
+    """Plays a sentence by writing the samples to the standard input of a program."""
 
     real_time = True
 

@@ -222,7 +222,7 @@ class PulsePlayer(Player):
             pass
 
     def _advance_stream(self) -> bool:
-        """Open, check or drain the stream if this is due. Return whether to run libpulse again."""
+        """Open, check or drain the stream if necessary. Return whether to run libpulse again."""
         if self._error is not None or self._drained:
             return False
         state = self._lib.context_get_state(self._context)
@@ -295,7 +295,7 @@ class PulsePlayer(Player):
         return changed
 
     def _request_time(self) -> bool:
-        """Request the playback time if this is due. Return whether a request was sent."""
+        """Request the playback time if a request is due. Return whether a request was sent."""
         if time.monotonic() < self._time_request_at:
             return False
         self._time_request_at = NEVER
@@ -331,7 +331,7 @@ class PulsePlayer(Player):
         return self._pending_levels > 0 or time.monotonic() < self._volume_settled_at
 
     def _record_mute(self) -> None:
-        """If the output is muted, record this, and fail the sentence if it must be audible."""
+        """If the output is muted, record the mute state, and fail a sentence that must be audible."""
         levels = [each for each in (self._sink_level, self._stream_level) if each is not None]
         if self._drained or self._is_volume_pending() or not any(each.muted or each.volume == 0 for each in levels):
             return

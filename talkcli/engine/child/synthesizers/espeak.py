@@ -91,7 +91,7 @@ def _events_of(pointer: Any) -> Iterator[_EspeakEvent]:
 
 
 def load_library() -> tuple[Any, str, int]:
-    """Initialize libespeak-ng. Return pyttsx3's binding of it, its version and the sample rate.
+    """Initialize libespeak-ng. Return pyttsx3's binding, the library's version and the sample rate.
 
     The library of the system is preferred. If it is missing, the library from the package espeakng-loader is used. Call
     this once per process, before anything imports `pyttsx3.drivers._espeak`, which also loads the library.

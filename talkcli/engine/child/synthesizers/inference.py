@@ -32,14 +32,15 @@ if TYPE_CHECKING:
 
 os.environ.update(PACKAGE_VARIABLES)  # these variables must be set before the packages are imported
 
-#: How many extra frames to decode before and after a part, because they affect its samples. The calculated value for
-#: Piper's largest decoder ("high") is 13.4. With 10 frames, the samples of a "medium" decoder differ by 1 in 400,000.
+#: How many extra frames to decode before and after a part, because they affect the part's samples. The calculated value
+#: for Piper's largest decoder ("high") is 13.4. With 10 frames, the samples of a "medium" decoder differ by 1 in
+#: 400,000.
 CONTEXT_FRAMES = 14
 #: The maximum size of a model. The size of Piper's models is 15 to 120 MB.
 _MAX_MODEL_BYTES = 1 << 28
 #: The maximum average number of frames per phoneme (including padding), and the maximum number of samples per frame. A
-#: model that exceeds them could make minutes of sound from one sentence and use gigabytes of memory. At its natural
-#: pace, en_US-joe-medium has 4 frames per phoneme on average, and 35 at most. Piper's frames have 256 samples.
+#: model that exceeds these limits could make minutes of sound from one sentence and use gigabytes of memory. At its
+#: natural pace, en_US-joe-medium has 4 frames per phoneme on average, and 35 at most. Piper's frames have 256 samples.
 _MAX_MEAN_FRAMES, _MAX_FRAME_SAMPLES = 40, 4096
 #: If an error message contains one of these texts, onnxruntime or the dynamic linker has run out of memory.
 _NO_MEMORY = (

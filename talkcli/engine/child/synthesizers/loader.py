@@ -145,7 +145,7 @@ class ModelLoader:
         return self._started_at + LOAD_LIMIT_S
 
     def unload(self, voice: str) -> None:
-        """Unload a voice, and forget its error.
+        """Unload a voice, and forget its last error.
 
         If the voice is speaking, its memory is freed after the sentence.
         """

@@ -67,7 +67,7 @@ class Phonemizer(Protocol):
 
 @frozen
 class SpeechPart:
-    """The phonemes of a sentence, or of a part of a long one."""
+    """The phonemes of a sentence, or of a part of a long sentence."""
 
     #: IPA characters, blanks and punctuation marks; never empty
     phonemes: tuple[str, ...]

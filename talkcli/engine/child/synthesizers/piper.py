@@ -84,7 +84,7 @@ class Piper:
 
     @property
     def problem(self) -> str | None:
-        """The reason why the current voice can't speak, or None if it is loaded."""
+        """The reason why the current voice can't speak, or None if the voice is loaded."""
         if self.loader.get_model(self._model_id) is not None:
             return None
         return self.loader.errors.get(self._model_id) or f"{self.voice} is not loaded"
