@@ -151,7 +151,7 @@ _ERRORS_BY_CODE: dict[str, type[RequestRefused]] = {
 
 
 def refusal(code: str, message: str, items: list[dict[str, object]] | None = None) -> RequestRefused:
-    """Return the exception for an error reply. It contains any list items sent before the reply."""
+    """Return the exception for an error reply, with any list items that were sent before the reply."""
     return _ERRORS_BY_CODE.get(code, RequestRefused)(message, code, items)
 
 

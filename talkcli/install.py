@@ -45,7 +45,7 @@ def command(*packages: str, reinstall: bool = False) -> str:
 
 
 def neural_command(*more: str, reinstall: bool = False) -> str:
-    """Return the shell command that installs the packages for neural voices, or why there is none.
+    """Return the shell command that installs the packages for neural voices, or a reason why they can't be installed.
 
     On a 32-bit system, there is none.
     """
@@ -55,7 +55,7 @@ def neural_command(*more: str, reinstall: bool = False) -> str:
 
 
 def espeak_command() -> str:
-    """Return one or two alternative shell commands that install libespeak-ng, as a single text."""
+    """Return a text with one or two alternative shell commands that install libespeak-ng."""
     package = "sudo apt-get install -y libespeak-ng1"
     return f"{package}, or {command('espeakng-loader')}" if IS_64_BIT else package
 

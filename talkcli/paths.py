@@ -118,7 +118,7 @@ def sudo_caller_socket() -> str | None:
 
 
 def server_socket(named: str | None) -> str:
-    """Return the path for a server's socket. Create the directory of the default path.
+    """Return the path for a server's socket. If it is the default path, create its directory.
 
     Raises:
         AddressInUse: the directory is missing or not safe.
@@ -176,7 +176,7 @@ def cache_directory() -> str:
 
 
 def history_file(option: str, socket: str) -> str:
-    """Return the path of a server's history. Its directory may not exist yet.
+    """Return the path of a server's history file. The file's directory may not exist yet.
 
     Args:
         option: the value of --history, which is the path if it contains "/".
@@ -187,7 +187,7 @@ def history_file(option: str, socket: str) -> str:
 
 
 def history_files(named: str | None) -> list[str]:
-    """Return the paths where the servers that a client tries may have their histories.
+    """Return the possible paths of the history files of all servers that a client tries.
 
     If `named` is given, it is the path of the only server's socket. Otherwise, only the last one is the socket of the
     system-wide server.
@@ -198,7 +198,7 @@ def history_files(named: str | None) -> list[str]:
 
 
 def _history_name(socket: str) -> str:
-    """Return the file name of the history of the server with this socket."""
+    """Return the name of the history file for the server with this socket."""
     path = os.path.realpath(socket).lstrip("/")
     return f"{path.replace('%', '%25').replace('-', '%2d').replace('/', '-')}.db"
 

@@ -1,4 +1,4 @@
-"""Information about processes: the peer of a Unix socket, and the processes in /proc.
+"""Functions that get information about processes from a Unix socket or from /proc.
 
 Every client imports this module when it starts. It uses `_socket` instead of `socket`, because `socket` makes enums of
 all its constants. That takes a tenth of the time of a command that sends one request.
@@ -52,7 +52,7 @@ def command_name(pid: int) -> str | None:
 
 
 def ancestors(pid: int) -> Iterator[int]:
-    """Yield the process ids of up to eight ancestors of a process, its parent first."""
+    """Yield the process ids of up to eight ancestors of a process, starting with its parent."""
     for _ in range(_MAX_ANCESTORS_COUNT):
         stat = process_stat(pid)
         pid = int(stat[1]) if stat else 0

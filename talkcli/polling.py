@@ -56,7 +56,7 @@ def wait_ready(
 async def block_until_ready(
     watched: Mapping[int, int], timeout: float | None, interrupt: Mapping[int, int] | None = None
 ) -> set[int]:
-    """Call `wait_ready`, which blocks. Coroutines that run without an event loop use this function."""
+    """Call the blocking function `wait_ready`, for coroutines that run without an event loop."""
     return wait_ready(watched, timeout, interrupt)
 
 

@@ -148,7 +148,7 @@ def resume(options: CommonOptions) -> None:
 
 
 def _report_pause(options: CommonOptions, goal: Goal | None, *, paused: bool, message: str) -> None:
-    """Print a message that speech has been paused or resumed, or a JSON object with --json."""
+    """Report that speech has been paused or resumed, as a message or as a JSON object."""
     if options.json:
         show_json({"paused": paused, "goal": None if goal is None else goal.to_json()})
     elif not options.quiet:

@@ -251,7 +251,7 @@ class _CommandGroup(_HelpfulCommand, click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the command in the arguments. Return its name, the command and its own arguments.
+        """Find the command in the arguments. Return its name, the command and the remaining arguments.
 
         Raise click.UsageError for an unknown command.
         """
@@ -357,7 +357,7 @@ def _quote_for_shell(text: str) -> str:
 
 
 def _describe_error(error: click.ClickException) -> str:
-    """Return the text of a click error, in the style of `talk`."""
+    """Return the message of a click error in the style of `talk`."""
     if isinstance(error, click.NoSuchOption):
         # Leading dashes would make unrelated options look similar.
         near = nearest(error.option_name.lstrip("-"), [each.lstrip("-") for each in error.possibilities or ()])

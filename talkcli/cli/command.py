@@ -256,7 +256,7 @@ def _parse_duration(text: str, unit: str) -> float:
 
 
 def _parse_moment(text: str) -> float:
-    """Convert a time of day, a day, both, or a time before now to seconds since 1970. Times are local.
+    """Convert a local date or time, or a duration before now, to seconds since 1970.
 
     Raises:
         ValueError: the text is malformed.

@@ -95,7 +95,7 @@ def _say_fault(values: Mapping[str, Any], typed: frozenset[str]) -> str | None:
 
 
 def _goal_fault(values: Mapping[str, Any]) -> str | None:
-    """Return an error message if options of `say` and `play` can't be combined."""
+    """Return an error message if options that `say` and `play` share can't be combined."""
     if values["flush"] and values["preempt"] is False:
         return "--flush and --queue can't be combined; leave out one of them"
     if values["timeout"] is not None and not (values["wait"] or values.get("feedback")):
@@ -226,7 +226,7 @@ def _serve_fault(values: Mapping[str, Any], _: frozenset[str]) -> str | None:
 
 
 def _pause_fault(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
-    """Return an error message if `pause` has a COMMAND without --while, or the other way round."""
+    """Return an error message if `pause` has a COMMAND without --while, or --while without a COMMAND."""
     if given["while_connected"] != bool(given["command"]):
         return "--while and COMMAND belong together, as in: talk pause --while -- ./listen.py"
     return None
@@ -240,7 +240,7 @@ def _bridge_fault(values: Mapping[str, Any], _: frozenset[str]) -> str | None:
 
 
 def _log_fault(values: Mapping[str, Any], _: frozenset[str]) -> str | None:
-    """Return an error message if `log` could show no goal because of its times."""
+    """Return an error message if the times in --since and --until exclude all goals."""
     since, until = values["since"] or 0.0, values["until"]
     if since > time.time():
         return "--since is in the future; for a time on the day before, write: --since 'yesterday 14:00'"

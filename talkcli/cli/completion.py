@@ -52,7 +52,7 @@ _BASH_SPECIAL = re.compile(r"[^\w@%+=:,./-]")
 
 
 def print_completions(talk: click.Command, options: CommonOptions) -> int:
-    """Print the completions that the shell's script asks for. Return the exit code."""
+    """Print the completions that the shell's completion script requests. Return the exit code."""
     try:
         click.echo("\n".join(_completion_lines(talk, options)).encode())
     except Exception:
@@ -206,7 +206,7 @@ def unfinished_keys(options: CommonOptions, _: str) -> Offers:
 
 
 def voices(options: CommonOptions, incomplete: str) -> Offers:
-    """Return languages, voice ids or voice names as completions, whichever match first.
+    """Return completions for a voice: languages, ids or names, whichever match first.
 
     Neural voices are always offered by id, because there are few of them and users select them by id.
     """
@@ -250,7 +250,7 @@ def players(_: CommonOptions, __: str) -> Offers:
 
 
 def _request_status(options: CommonOptions) -> ServerStatus:
-    """Request and return the server's status, with a time limit of half a second."""
+    """Request the server's status with a time limit of half a second. Return the status."""
     with options.connect(COMPLETION_TIMEOUT_S) as client:
         return client.status()
 

@@ -139,7 +139,7 @@ class _TerminalFeedback(Feedback):
         self._paint()
 
     def close(self) -> None:
-        """Finish the current line, and stop watching the terminal's size."""
+        """End the current line, and stop watching the terminal's size."""
         self._resizes.close()
         if self._line:
             self._write_whole_text(self._line)

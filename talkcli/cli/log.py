@@ -1,4 +1,4 @@
-"""`talk log`: shows the goals that have ended.
+"""The command `talk log`, which shows the goals that have ended.
 
 If no server is running, the command reads the history of the last one.
 """
@@ -29,7 +29,7 @@ _SEARCH_LIMIT_S = 60.0
 
 
 def log(options: CommonOptions, count: int | None, long: bool, **filters: Any) -> None:
-    """Show the goals that have ended most recently and pass the filters."""
+    """Show the most recently ended goals that pass the filters."""
     from talkcli.terminal.transcript import log_lines
 
     given = {name: value for name, value in filters.items() if value is not None}

@@ -1,4 +1,4 @@
-"""Runs the program of `talk pause --while`."""
+"""Runs the program that is given to `talk pause --while`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _HANDLED_SIGNALS = {*_FROM_TERMINAL, signal.SIGTERM, signal.SIGHUP, signal.SIGCH
 
 
 def run_program(command: Sequence[str]) -> int:
-    """Run a program until it ends, and pass on signals to it. Return its exit code, as in a shell.
+    """Run a program to its end, and pass signals on to it. Return its exit code, as a shell would.
 
     Raises TalkError with the exit code 126 or 127 if the program can't be started. After this call, this process no
     longer receives the signals.

@@ -1,4 +1,4 @@
-"""The commands `talk say`, which speaks a text or writes the speech to a file, and `talk play`, which plays a sound.
+"""The commands `talk say`, which speaks a text, and `talk play`, which plays a sound.
 
 The modules `stdin` and `stream` read standard input. This module must not import click, because simple command lines
 are run without it. Only `-o` imports the engine, because it works without a server.
@@ -120,7 +120,7 @@ def play(options: CommonOptions, sound: str, list: bool, **given: Any) -> int:  
 def _read_input(
     options: CommonOptions, timeout: float | None, wait: bool, feedback: bool, output: str | None
 ) -> str | int:
-    """Read and return all of standard input, or return an exit code if it is interrupted or too long.
+    """Read all of standard input. Return the text, or an exit code if the input is interrupted or too long.
 
     Closed output also interrupts the reading. A text that is too long is reported.
     """
@@ -155,7 +155,7 @@ def _report_sent(goal: GoalHandle, options: CommonOptions, reporter: GoalReporte
 def _run_without_goal(
     path: str | None, text: str, values: dict[str, Any], timeout: float | None, options: CommonOptions
 ) -> int:
-    """Write a text's speech to a file, or print the text as it would be said. Return the exit code.
+    """Write the speech for a text to a file, or print the text as it would be said. Return the exit code.
 
     A dry run with a file renders the text, but writes nothing. A dry run without one asks the server.
     """
@@ -183,7 +183,7 @@ def _run_without_goal(
 def _write_wav_file(
     path: str | None, text: str, values: Mapping[str, Any], timeout: float | None, options: CommonOptions
 ) -> int:
-    """Write a text's speech to a WAV file, or to standard output for "-". Return the exit code.
+    """Write the speech for a text to a WAV file, or to standard output if the path is "-". Return the exit code.
 
     If there is no path, render the text, but write nothing.
     """

@@ -181,7 +181,7 @@ def _print_unit(
     named = {long_flag(each): given[each.name] for each in row.options if each.kind is PATH}
     named |= {"--socket": socket, "--player file:": colon and os.path.abspath(file), "--player": player.split(" ")[0]}
     for flag, path in named.items():
-        if path and os.path.isabs(path) and (problem := _find_hidden_path(flag, path, hides_home=home == "yes")):
+        if path and os.path.isabs(path) and (problem := _path_fault(flag, path, hides_home=home == "yes")):
             note(f"{flag} names {printable(path)}, but {problem}; {_HIDDEN_PATH_ADVICE.get(flag, _LET_READ)}")
     if hidden := _find_inaccessible_file(files):
         file, directory = hidden
@@ -213,7 +213,7 @@ def _format_option(option: Option, value: object) -> str:
     return f"{long_flag(option)}={value:04o}" if option.kind is FILE_MODE else f"{long_flag(option)}={value}"
 
 
-def _find_hidden_path(flag: str, path: str, *, hides_home: bool) -> str | None:
+def _path_fault(flag: str, path: str, *, hides_home: bool) -> str | None:
     """Return why the system-wide service can't use the path in an option, or None if it can.
 
     Args:

@@ -43,7 +43,7 @@ _NO_BREAK_SPACE = "\0"
 
 
 class CommonOptions:
-    """The options common to all commands. It opens connections, and knows when the command started."""
+    """The options that all commands have, with methods that open connections."""
 
     socket: str | None = None
     robot: str | None = None
@@ -182,7 +182,7 @@ def reader_is_gone(error: OSError) -> bool:
 
 
 def handle_output_error(error: Exception) -> int | None:
-    """Discard output after a failed write. Return the exit code, or None for other errors.
+    """Discard the output if an error shows that writing has failed. Return the exit code, or None for other errors.
 
     A full or broken disk is reported.
     """
@@ -377,7 +377,7 @@ class Feedback:
         note(message)
 
     def close(self) -> None:
-        """Finish the display before other output is written.
+        """Close the display, so that other output can be written.
 
         In the base class, there is nothing to do.
         """

@@ -327,7 +327,7 @@ class LineSpeaker(InputSpeaker):
 
     @property
     def _done(self) -> bool:
-        """Whether nothing is left to send or, with --wait, to follow."""
+        """Whether there are no more lines to send and, with --wait, no more goals to follow."""
         if self._wait and self._goals:
             return False
         return self._error is not None or not (self._unanswered or self._has_lines)
@@ -407,7 +407,7 @@ class LineSpeaker(InputSpeaker):
         self._unanswered = handle, self._connection.begin(request, accepted)
 
     def _process_answer(self) -> None:
-        """Report whether the server has accepted the last sent line, if it has answered.
+        """If the server has answered, report whether it accepted the last sent line.
 
         Follow an accepted goal.
         """

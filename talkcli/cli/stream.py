@@ -1,4 +1,4 @@
-"""`talk say --stream`: speak standard input as it arrives.
+"""The command `talk say --stream`, which speaks standard input as it arrives.
 
 One thread reads the input, sends it, and follows the goal. While much of the text has not been heard, the server holds
 back its reply. In this time, no input is read, so the program that writes the input has to wait, too.

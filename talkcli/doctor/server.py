@@ -290,7 +290,7 @@ def _judge_settings(server: JsonObject) -> Finding:
 
 
 def _judge_pronunciations(found: object) -> list[Finding]:
-    """Check the file of pronunciations. Return the finding, or nothing if the server was started without a file."""
+    """Check the file of pronunciations. Return one finding, or none if the server has no such file."""
     if not isinstance(found, dict):
         return []
     problems = [str(each) for each in found["problems"]]
@@ -300,7 +300,7 @@ def _judge_pronunciations(found: object) -> list[Finding]:
 
 
 def _judge_history(history: object) -> list[Finding]:
-    """Check whether the server can write its history. Return one finding, or none without a history."""
+    """Check whether the server can write its history. Return one finding, or none if the server has no history."""
     if not isinstance(history, dict):
         return []
     path, error, replaced = (history.get(each) for each in ("path", "error", "replaced"))

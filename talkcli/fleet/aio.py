@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 class LoopRobotConnection(LoopConnection, RobotConnection):
-    """A connection to a robot that is run by the event loop."""
+    """A connection to a robot that uses an asyncio event loop."""
 
 
 class FleetRequest(FleetRequestCalls):
@@ -83,5 +83,5 @@ class Fleet(FleetCalls[FleetRequest]):
         return client
 
     def _send_request(self, to: str, request: Request) -> FleetRequest:
-        """Return a request to the selected robots, without sending it."""
+        """Create a request to the selected robots, without sending it."""
         return FleetRequest(self._broker, Selection(to), request, name=self._name, wait=wait_ready)

@@ -33,7 +33,7 @@ FleetRequestT = TypeVar("FleetRequestT")
 
 
 class FleetCalls(Generic[FleetRequestT]):
-    """The base class of fleets. It has the methods that create requests."""
+    """The base class of fleets, with the methods that create requests."""
 
     def __init__(self, broker: str | None = None, *, name: str | None = None, insecure: bool = False) -> None:
         """Configure access to a fleet, without connecting to the broker.
@@ -115,7 +115,7 @@ class FleetCalls(Generic[FleetRequestT]):
         return self._send_request(to, Set(**settings))
 
     def _send_request(self, to: str, request: Request) -> FleetRequestT:
-        """Return a request to the selected robots."""
+        """Create a request to the selected robots."""
         raise NotImplementedError
 
 

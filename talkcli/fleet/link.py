@@ -88,7 +88,7 @@ def boottime() -> float:
 
 
 def is_denied(code: int) -> bool:
-    """Return whether a reason code says that the user may not use a topic."""
+    """Return whether a reason code means that the user may not use a topic."""
     return code in _REASONS_TOPIC_DENIED
 
 
@@ -444,7 +444,7 @@ class LinkOpener:
         threading.Thread(target=self._open, name="talk: connecting", daemon=True).start()
 
     def cancel(self) -> None:
-        """Close the link. If it is still being opened, close it afterwards."""
+        """Close the link. If the link is still being opened, it is closed afterwards."""
         with self._lock:
             self._canceled = True
             if self.done:

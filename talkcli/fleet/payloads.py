@@ -81,7 +81,7 @@ class Presence:
 
 
 def bridge_rank(presence: Presence | None) -> tuple[float, str] | None:
-    """Return a bridge's rank. Of several bridges with one name, the one with the lowest rank stays.
+    """Return a bridge's rank. Of several bridges with the same name, the one with the lowest rank stays.
 
     The other bridges exit. Return None if the bridge is offline.
     """

@@ -88,7 +88,7 @@ class SpeechTimes:
         self._starts: OrderedDict[str | bytes, tuple[float, str]] = OrderedDict()
 
     def add(self, record: Record) -> None:
-        """Record when a goal started, for its key and for its text.
+        """Record the start time of a goal under its key and its text.
 
         The goal must have been heard, at least in part.
         """
@@ -97,7 +97,7 @@ class SpeechTimes:
                 _set_newest(self._starts, each, (record.began_at, record.id), MAX_SPEECH_TIMES)
 
     def last_goal_id(self, since: float, key: str | None, content: str) -> str | None:
-        """Return the id of the last goal started after `since` with this key (or text or sound, if key is None).
+        """Return the id of the last goal after `since` with this key. If `key` is None, compare the content.
 
         Return None if no such goal has started. Times are monotonic.
         """

@@ -162,7 +162,7 @@ def _log_count_error(value: int) -> str | None:
 
 
 def _moment_error(value: float) -> str | None:
-    """Return an error message if a number is too large for a point in time, or NaN."""
+    """Return an error message if a number is NaN or too large for a point in time."""
     return None if abs(value) <= _MAX_MOMENT_S else "must be a time in seconds since 1970"
 
 
@@ -647,7 +647,7 @@ class Say:
 
     @property
     def content(self) -> str:
-        """The text, or the name of a sound with a mark in front that distinguishes it from a text."""
+        """The text, or the marked name of a sound. The mark distinguishes the name from a text."""
         return f"\0{self.text}" if self.is_sound else self.text
 
 
@@ -773,7 +773,7 @@ class Cancel:
         return self.ids is None and not self.current and self.before is None and self.key is None
 
     def select_waiting(self, goals: Sequence[Say]) -> list[int]:
-        """Return the indexes of the goals to cancel among those that wait for room in the queue.
+        """Return the indexes of the goals to cancel. All given goals are waiting for room in the queue.
 
         Such a goal has an id only if its sender chose one. Therefore, `before` must name an id of this kind to select
         any.
@@ -841,7 +841,7 @@ DEFAULTS = Set(**{each.name: each.setting.initial for each in SETTINGS if each.s
 
 
 def bad_option(request: Say | Set | Pause | Log) -> str | None:
-    """Return an error message if a request has a value or combination that is not allowed."""
+    """Return an error message if a value or a combination of values in a request is not allowed."""
     if isinstance(request, Say) and request.flush and request.preempt is False:
         return "flush can't be combined with preempt false, because it always interrupts"
     if isinstance(request, Say) and request.interject and (request.flush or request.preempt):
@@ -860,7 +860,7 @@ def bad_option(request: Say | Set | Pause | Log) -> str | None:
 
 
 def bad_text(text: str, max_chars: int | None = MAX_TEXT_CHARS) -> Refusal | None:
-    """Return a reason and a message if a text is too long, malformed or without visible characters.
+    """Return a reason and a message if a text is too long, is malformed or has no visible characters.
 
     Args:
         text: the text.
@@ -924,12 +924,12 @@ def engine_options(say: Say, settings: Set) -> dict[str, Any]:
 
 
 def shown_settings(settings: Set) -> JsonObject:
-    """Return the settings as a JSON object, with None for the default voice or no time limit."""
+    """Return the settings as a JSON object in which None means the default voice or no time limit."""
     return _replace_placeholders(fields(settings))
 
 
 def _replace_placeholders(values: dict[str, Any]) -> dict[str, Any]:
-    """Return a copy of settings, with None for each placeholder, such as a `ttl` of 0."""
+    """Return a copy of settings in which placeholders, such as a `ttl` of 0, are replaced with None."""
     return {name: None if value == _NONE_VALUES.get(name) else value for name, value in values.items()}
 
 

@@ -55,7 +55,7 @@ class Queue:
         return self._goals[0][2] if self._goals else None
 
     def interjections(self) -> Iterator[Record]:
-        """Return an iterator over the pending interjections in their order."""
+        """Return an iterator over the pending interjections in speaking order."""
         return map(_record_of, self._interjections)
 
     def with_key(self, key: str | None) -> Record | None:
@@ -85,9 +85,9 @@ class Queue:
         return self._displaceable[-1][2] if self._displaceable else None
 
     def add(self, record: Record, replaced: Record | None = None) -> None:
-        """Add a goal to the queue, at the place of the already removed goal `replaced`, if any.
+        """Add a goal to the queue. If it replaces a goal that was removed, it takes that goal's place.
 
-        Otherwise, its place is behind the other goals of its kind and priority, or in front of them if it preempts.
+        Otherwise, its place is after the other goals of its kind and priority, or before them if it preempts.
 
         Args:
             record: the new goal.
@@ -118,7 +118,7 @@ class Queue:
         return list(map(_record_of, self._expiries[: bisect_left(self._expiries, (now, inf))]))
 
     def _entries(self, record: Record) -> Iterator[tuple[list[_Entry], _Entry]]:
-        """Yield each sorted list in which a goal belongs, and the goal's entry for that list."""
+        """Yield each sorted list that contains a goal while it is queued, with the goal's entry in the list."""
         entry = -record.say.priority, record.position, record
         yield self._goals, entry
         yield self._displaceable, (-record.say.priority, record.number, record)

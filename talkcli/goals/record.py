@@ -102,7 +102,7 @@ class Record:
 
     @property
     def was_heard(self) -> bool:
-        """Whether any of the goal was heard: a word, or some of a sound."""
+        """Whether at least one word of the text, or a part of the sound, was heard."""
         return self.begun_end > 0 or (self.say.is_sound and self.heard > 0)
 
     def change_state(self, state: State) -> None:

@@ -64,7 +64,7 @@ class StateChange:
 
 @frozen
 class Interruption:
-    """An effect that publishes which goal interrupts this one.
+    """An effect that publishes that one goal interrupts another.
 
     When the goal continues, a StateChange to ACTIVE follows.
     """
@@ -99,7 +99,7 @@ class SpeechPause:
 
 
 class Order(Enum):
-    """A kind of order to the engine, such as to start or stop a goal.
+    """A kind of order to the engine, such as starting or stopping a goal.
 
     The value is the order's name in the log.
     """
@@ -131,7 +131,7 @@ Effect = StateChange | Interruption | PauseChange | EngineOrder | VoiceLoadOrder
 
 @dataclass(slots=True)
 class Cancellation:
-    """The goals that a cancel found, the ids it didn't find, and the effects to carry out."""
+    """The result of a cancel request: the goals found, the unknown ids, and the effects to carry out."""
 
     #: pending and interrupted goals, which this cancel has ended at once
     ended_at_once: list[Record] = field(default_factory=list)
@@ -203,7 +203,7 @@ class Scheduler:
     # -- goals
 
     def unfinished(self) -> list[Record]:
-        """Return the active goal, if any, the interrupted goals and the pending goals, in speaking order."""
+        """Return all unfinished goals in speaking order: the active goal, the interrupted and the pending ones."""
         return [*self.begun()[::-1], *self.pending]
 
     def begun(self) -> list[Record]:
@@ -211,7 +211,7 @@ class Scheduler:
         return [*self.interrupted, *([self.active] if self.active else [])]
 
     def next_goal(self) -> Record | None:
-        """Return the goal that follows the active one, or None if there is none.
+        """Return the goal to speak after the active one, or None if no goal is waiting.
 
         Interrupted goals continue before other goals start, but after interjections, unless those have a lower
         priority.
@@ -317,7 +317,7 @@ class Scheduler:
         return record, effects + self._order_next_voice(now)
 
     def try_out(self, say: Say, sender: Sender, now: Now, server_refusal: Refusal | None) -> Record:
-        """Check a goal without adding it to the queue. Return its record, which is PENDING or REJECTED and has no id.
+        """Check a goal without queueing it. Return its record, which has no id and is PENDING or REJECTED.
 
         The arguments are those of `submit`.
         """
@@ -329,7 +329,7 @@ class Scheduler:
     def cancel(
         self, selection: Cancel, sender: Sender | None, now: Now, waiting_ids: Collection[str | None] = ()
     ) -> Cancellation:
-        """Cancel goals, and unknown ones if they arrive soon. Return the affected goals and the effects.
+        """Cancel goals, including unknown ones that arrive soon. Return the affected goals and the effects.
 
         Pending and interrupted goals end at once. The active goal ends when the engine is silent. Unknown
         ids are remembered, and a goal with such an id is cancelled if it arrives soon.
@@ -402,7 +402,7 @@ class Scheduler:
         return [EngineOrder(record, Order.APPEND)] if record is self.active and (added or addition.end) else []
 
     def producer_left(self, record: Record, now: Now) -> list[Effect]:
-        """End an incomplete goal whose client left, unless another may continue it. Return the effects.
+        """End an incomplete goal after its client has left, unless another client may continue it. Return the effects.
 
         Another connection can continue the text only if the sender chose the goal's id.
         """
@@ -484,7 +484,7 @@ class Scheduler:
         return [*effects, EngineOrder(self.active, Order.RESUME), *self._interrupt_active()]
 
     def end_pause(self, connection: object, now: Now) -> list[Effect]:
-        """End the pause that lasts as long as a connection, if there is one. Return the effects."""
+        """End the pause that belongs to a connection, if there is one. Return the effects."""
         ended = self._pauses.pop(connection, None)
         return self._resume_if_all_ended(ended.client, now) if ended else []
 
@@ -550,7 +550,7 @@ class Scheduler:
         return effects + self.failed(record.id, Reason.ENGINE_FAILED, message, None, now) if record else effects
 
     def word_heard(self, goal_id: str, start: int, end: int, seconds: float) -> None:
-        """Record that a word of the active goal has started, and its position in the audio.
+        """Record the start of a word of the active goal, and the word's position in the audio.
 
         All words before it were heard to their end.
 
@@ -717,7 +717,7 @@ class Scheduler:
         return self._order_voice_drops() + self._order_next_voice(now)
 
     def voice_unloaded(self, voice: str, now: Now) -> list[Effect]:
-        """Record that the engine dropped a voice on its own. Return the order to load the next one, if any."""
+        """Record that the engine dropped a voice on its own. Return the order to load the next voice, if any."""
         self.voices.unloaded(voice, self._needed_voices())
         return self._order_next_voice(now)
 
@@ -784,7 +784,7 @@ class Scheduler:
         return sorted(unique, key=lambda each: (each is self.active, each.number))
 
     def _find_refusal(self, say: Say, server_refusal: Refusal | None, conflicting: Record | None) -> Refusal | None:
-        """Return the reason to reject a goal, if there is one other than a full queue.
+        """Return the reason to reject a goal, if there is one. A full queue is not considered.
 
         Args:
             say: the goal.
@@ -824,7 +824,7 @@ class Scheduler:
         return Reason.THROTTLED, f"{what} {words}"
 
     def _may_preempt(self, say: Say) -> bool:
-        """Return whether a goal may end others.
+        """Return whether a new goal may end other goals.
 
         The goal's options take precedence over the server's setting.
         """
@@ -851,7 +851,7 @@ class Scheduler:
         return [(last, Reason.DISPLACED)] if last and last.say.priority <= limit else None
 
     def _enqueue(self, record: Record, to_recall: list[tuple[Record, Reason]], now: Now) -> list[Effect]:
-        """Add a goal to the queue, recall other goals, and stop the active and interrupted goals if it preempts them.
+        """Add a goal to the queue, recall the given goals, and stop started goals that the new goal preempts.
 
         Return the effects.
         """
@@ -946,7 +946,7 @@ class Scheduler:
         return self.voices.patience_end(record, self.wanted_voice(record)) if waits else 0.0
 
     def _find_interjection(self, priority: int) -> Record | None:
-        """Return the first waiting interjection with at least this priority, if any. Its voice must be usable now."""
+        """Return the first waiting interjection of at least this priority that needn't wait for its voice, if any."""
         for each in self.pending.interjections():
             if each.say.priority < priority:
                 break
@@ -955,7 +955,7 @@ class Scheduler:
         return None
 
     def _interrupt_active(self) -> list[Effect]:
-        """Interrupt the active goal if an interjection is waiting for that. Return the order, if any.
+        """Interrupt the active goal if an interjection is waiting. Return the order, if any.
 
         Another interjection is only interrupted by one with a higher priority. A goal that preempts is not interrupted
         by an older interjection, because it goes before that in the queue, too.

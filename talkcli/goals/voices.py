@@ -239,7 +239,7 @@ class VoiceScheduler:
             found.fail(error, now)
 
     def measured(self, voice: str, total_bytes: int) -> None:
-        """Record how much memory all voices use, and attribute the change to one of them.
+        """Record how much memory all voices use, and attribute the change to one voice.
 
         Args:
             voice: the voice that was just loaded or has just spoken, or "" if a voice was dropped.
@@ -260,7 +260,7 @@ class VoiceScheduler:
             self._voices[voice] = NeuralVoice(found.size_bytes)
 
     def engine_lost(self, now: float) -> list[VoiceWarning]:
-        """Forget the loaded voices after the engine process exits. Return a warning if one is to blame.
+        """Forget the loaded voices after the engine process exits. Return a warning if a voice is to blame.
 
         A voice is to blame if the engine has died repeatedly while loading it.
         """
@@ -291,7 +291,7 @@ class VoiceScheduler:
         return max(self._used_bytes, sum(self._loaded_bytes().values()))
 
     def _voices_to_drop(self, size_bytes: int, keep: Collection[str]) -> tuple[str, ...] | None:
-        """Return the voices to drop to make room for a new one, or None if it can't fit.
+        """Return the voices to drop to make room for a new voice, or None if the new voice can't fit.
 
         The least recently used voices are dropped first.
 

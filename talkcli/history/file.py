@@ -1,4 +1,4 @@
-"""Writes and searches the SQLite file of a history.
+"""Code that writes and searches the SQLite file of a history.
 
 All functions may wait for the disk. If the file can't be used, they raise HistoryError.
 """
@@ -171,7 +171,7 @@ class HistoryWriter:
         return self._connection
 
     def _start_anew(self, goals: Sequence[Goal]) -> str:
-        """Rename a damaged file, and write goals to a new one. Return a message about this."""
+        """Rename a damaged file, and write goals to a new one. Return a message that explains the change."""
         self.close()
         for suffix in ("", "-wal", "-shm"):
             with contextlib.suppress(FileNotFoundError):

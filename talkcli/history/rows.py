@@ -58,7 +58,7 @@ def given_filters(log: Log) -> JsonObject:
 
 
 def filter_values(goal: Goal) -> JsonObject:
-    """Return the values of a goal that filters need, by the names of their columns."""
+    """Return the values of a goal that filters compare, by column name."""
     name = goal.client.name if goal.client else None
     values = {"id": goal.id, "state": goal.state.name, "name": name, "key": goal.key}
     return {**values, "ended_at": goal.ended_at or 0.0, "text": goal.text or ""}
@@ -90,7 +90,7 @@ def row_chars(row: Row) -> int:
 
 
 def row_to_json(row: Row) -> JsonObject:
-    """Return the goal in a row, as the JSON object that clients get."""
+    """Return the goal in a row as the JSON object that clients receive."""
     columns = dict(zip(COLUMNS, row, strict=True))
     other, text = decode(columns.pop("other").encode()), columns["text"]
     del columns["name"]
@@ -111,5 +111,5 @@ def _without_command_line(sender: Sender | None) -> Sender | None:
 
 
 def _storable(value: object) -> object:
-    """Return a value that SQLite can store. In a text, halves of surrogate pairs become question marks."""
+    """Convert a value to one that SQLite can store. In a text, unpaired surrogates become question marks."""
     return value.encode(errors="replace").decode() if isinstance(value, str) else value

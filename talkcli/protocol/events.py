@@ -162,7 +162,7 @@ class TextMissing:
 
 @frozen
 class GoalInterrupted:
-    """Event sent when another goal interrupts a goal. When the goal continues, it is reported as ACTIVE again."""
+    """An event that is sent when another goal interrupts a goal. Later, the goal may become ACTIVE again."""
 
     id: str
     #: the goal that interrupts this one
@@ -262,7 +262,7 @@ def _event_json(
 
 
 def goals(items: list[JsonObject], name: str) -> Iterator[Goal]:
-    """Yield the goals in the field `name` of list items. Raise Unreadable if one is malformed."""
+    """Yield the goal in the field `name` of each list item that has one. Raise Unreadable if a goal is malformed."""
     return (Goal.from_json(each[name]) for each in items if name in each)
 
 

@@ -1,4 +1,4 @@
-"""Read and write lines of JSON. Each line contains one object.
+"""Functions that read and write lines of JSON. Each line contains one object.
 
 Rules for this file: no I/O. It knows lines and their limits, but not what a request means. Any received bytes become an
 object or a BadRequest. The functions that need `json` or the errors import them, for two reasons: a client writes its
@@ -102,7 +102,7 @@ def request_line(message: JsonObject) -> bytes:
 
 
 def _encode_simple(value: object) -> str:
-    """Encode a simple value as JSON. Raise TypeError if this needs the `json` module."""
+    """Encode a simple value as JSON. Raise TypeError for a value that needs the `json` module."""
     if isinstance(value, str):
         if value.isprintable() and '"' not in value and "\\" not in value:
             return f'"{value}"'

@@ -154,7 +154,7 @@ def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
 
 
 def describe_pause(status: JsonObject, screen: Screen | None = None) -> str:
-    """Say who paused speech, since when and until when, according to the server's status or a reply."""
+    """Describe a pause: who paused speech, since when, and until when."""
     by, at, until = By.from_json(status.get("paused_by")), status.get("paused_at"), status.get("paused_until")
     parts = [f" by {sender_forms(by.client, screen or Screen())[0]}"] if by and by.client else []
     parts += [f" since {clock_time(found)}"] if (found := read_seconds(at)) is not None else []

@@ -96,7 +96,7 @@ class Screen:
         return self.fit_name(number if number.isdecimal() else goal_id, _MIN_ID_COLUMNS, 8)
 
     def coloured(self, text: str, state: State | None) -> str:
-        """Give a text the colour of a goal state, or make it bold if the state is None.
+        """Return text in the colour of a goal state, or in bold if the state is None.
 
         Without colours, return it unchanged.
         """
@@ -105,7 +105,7 @@ class Screen:
 
 
 def printable(text: str, limit: int | None = None) -> str:
-    """Cut a text to `limit` characters, and escape invisible characters."""
+    """Cut text to `limit` characters, and escape invisible characters."""
     kept = text[:limit]
     if not (kept.isascii() and kept.isprintable() and "\\" not in kept):
         kept = "".join(map(_escape, kept))
@@ -121,7 +121,7 @@ def printable_json(line: str) -> str:
 
 
 def width(text: str) -> int:
-    """Return the width of a text in columns, ignoring colour codes.
+    """Return the width of text in columns, ignoring colour codes.
 
     If a character's width is ambiguous, the larger width is assumed. A line that is too short looks odd, but a line
     that is too long wraps.
@@ -131,7 +131,7 @@ def width(text: str) -> int:
 
 
 def cut(text: str, columns: int | None) -> str:
-    """Cut a text to a number of columns, and mark the cut with an ellipsis.
+    """Cut text to a number of columns, and mark the cut with an ellipsis.
 
     The text must not contain colour codes.
     """
@@ -142,14 +142,14 @@ def cut(text: str, columns: int | None) -> str:
 
 
 def cut_quoted(text: str, columns: int | None) -> str:
-    """Cut a text to a number of columns, but keep its closing quote."""
+    """Cut text to a number of columns, but keep its closing quote."""
     if columns is None or not (len(text) > 1 and text[0] == text[-1] == '"'):
         return cut(text, columns)
     return f'"{cut(text[1:-1], columns - 2)}"'
 
 
 def pad(text: str, columns: int) -> str:
-    """Pad a text with spaces to a number of columns."""
+    """Pad text with spaces to a number of columns."""
     return text + " " * (columns - width(text))
 
 
@@ -162,7 +162,7 @@ def longest_fitting(forms: Sequence[str], columns: int | None) -> str:
 
 
 def room_beside(text: str, columns: int, screen: Screen) -> int:
-    """Return how many of the `columns` the details beside a text may take up.
+    """Return how many columns are available for the details beside a text.
 
     The details leave at least half of the line to the text, or 16 columns if whole ids are shown.
     """
@@ -204,7 +204,7 @@ def wrap(pieces: Sequence[str], head: str, screen: Screen) -> list[str]:
 
 
 class MeasuredText:
-    """A text with precomputed character widths."""
+    """Text with precomputed character widths."""
 
     def __init__(self, text: str) -> None:
         self._shown: list[str] = []
@@ -259,7 +259,7 @@ class MeasuredText:
         return "".join(self._shown[start:end])
 
     def _first_shown(self, column: int, max_index: int) -> int:
-        """Return the index of the first character to show right of `column`, at most `max_index`."""
+        """Return the index of the first character to show to the right of `column`, at most `max_index`."""
         if column <= 0:
             return 0
         # The ellipsis takes one more column. The first visible character must not be a combining mark.

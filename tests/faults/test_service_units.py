@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.cli.services import _find_hidden_path
+from talkcli.cli.services import _path_fault
 from talkcli.daemon.systemd import NOTIFY_RETRY_DELAY_S, STATUS_DELAY_S
 from talkcli.install import NEURAL_PACKAGES
 from tests.conformance.bareserve import SERVE, TALK, BareServe, environment, run, serving
@@ -243,7 +243,7 @@ def test_printing_the_system_unit_warns_about_paths_that_the_unit_hides(
         hidden = [line for line in notes if " names " in line]
         assert len(hidden) == (1 if warning and name == "system" else 0)
         assert not hidden or str(warning) in hidden[0]
-    hidden_home = _find_hidden_path("--pronounce", "/home/a/n.txt", hides_home=True)
+    hidden_home = _path_fault("--pronounce", "/home/a/n.txt", hides_home=True)
     assert hidden_home == "the unit hides home directories (ProtectHome=)"
 
 

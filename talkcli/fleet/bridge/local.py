@@ -33,7 +33,7 @@ class LocalConnection(SocketConnection):
     wait = staticmethod(wait_ready)
 
     def __init__(self, attempt: ConnectionAttempt, *options: Any) -> None:
-        """Use the connection of an attempt that has read the server's greeting."""
+        """Take over the connection of an attempt that has received the server's greeting."""
         super().__init__(attempt, *options)
         self._loop = asyncio.get_running_loop()
         #: received lines that `read` has not returned yet

@@ -266,7 +266,7 @@ class Bridge:
         self._send_echo()
 
     def _claim_name(self) -> None:
-        """Subscribe to the robot's requests. When the broker has allowed this, the robot is online."""
+        """Subscribe to the robot's requests. The robot goes online once the broker has allowed this."""
         if self._claimed or self._link is None:
             return
         self._claimed = True

@@ -143,7 +143,7 @@ class Policy:
         self.newest_echo_at = 0.0
 
     def record_echo(self, sent_at_text: bytes, now: float) -> None:
-        """Record when a returned echo was sent, if it is the newest.
+        """Record when a returned echo was sent, unless a newer echo has already returned.
 
         An echo is a message from the bridge to itself. Ignore it if its time is invalid or later than `now`.
         """
@@ -153,7 +153,7 @@ class Policy:
                 self.newest_echo_at = sent_at
 
     def new_token(self, now: float) -> str:
-        """Return a token that shows that a message with this token was sent after `now`."""
+        """Return a token. Every message with this token must have been sent after `now`."""
         return f"{self._session} {now}"
 
     def decide(self, message: Message, kind: str, user: str, now: float) -> RemoteRequest | Refusal | Goodbye | Ignored:
@@ -197,7 +197,7 @@ class Policy:
         return RemoteRequest(user, reply_topic, seq, request, correlation, size, start_by)
 
     def _is_flood(self, message: Message, kind: str, user: str, now: float) -> bool:
-        """Count a message. Return whether its user sends too many messages, and it is no `cancel`."""
+        """Count a message. Return True if its user sends too many, unless the message is a `cancel`."""
         if now >= self._second_ends_at:
             self._message_counts.clear()
             self._second_ends_at = now + 1.0
@@ -206,7 +206,7 @@ class Policy:
         return self._message_counts[user] > MAX_MESSAGES_PER_S and not is_cancel
 
     def _check_request(self, request: Request, token: str | None, now: float) -> None:
-        """Raise BadRequest if the robot doesn't accept a request from the broker. Check the token of a `say`."""
+        """Raise BadRequest if a request from the broker is not allowed, or if a `say` may be too old."""
         needed = Say.kind if request.kind in ALLOWED_WITH_SAY else request.kind
         if needed not in self._allow:
             words = f"this robot's bridge does not allow {needed} requests; add {needed} to its --allow"
@@ -219,7 +219,7 @@ class Policy:
             raise BadRequest(f"{why}; send it again if it is still true", STALE_CODE)
 
     def _is_stale(self, token: str | None, now: float) -> bool:
-        """Return whether a message may be too old, according to its token, or to the newest echo without a token.
+        """Return whether a message may be too old. If it has no token, judge by the newest echo.
 
         The time in the token of another bridge process can't be compared, so such a message counts as too old.
         """
@@ -298,7 +298,7 @@ class RemoteGoals:
     """
 
     def __init__(self, ids: SentIds) -> None:
-        """Start without goals. `ids` knows the senders of the goals."""
+        """Create an empty collection. `ids` contains the senders of the goals."""
         self._ids = ids
         #: for each goal id: the goal's key, and whether the server has confirmed that the goal is pending
         self._goals: dict[str, tuple[str | None, bool]] = {}
@@ -321,7 +321,7 @@ class RemoteGoals:
         return not (say.preempt or say.flush)
 
     def has_room(self, say: Say, user: str) -> bool:
-        """Return whether a user's goal can be sent without exceeding the limit for remote goals, or the user's part.
+        """Return whether a user's goal can be sent without exceeding the limits for remote goals.
 
         There is always room for a goal that replaces another goal with the same key.
         """

@@ -156,7 +156,7 @@ class Publisher:
                 log.write_limited("line", f"the server sent a malformed message: {log.sanitize(str(error))}")
 
     def _on_watch_reply(self, server: LocalConnection, reply: JsonObject, items: list[JsonObject]) -> None:
-        """Store the server's status from its reply to `watch`, and report that it is connected."""
+        """Store the server's status from its reply to `watch`, and report that the server is connected."""
         status = ServerStatus.from_reply(reply, items)
         self._retry_s = _FIRST_SERVER_RETRY_S
         for each in unfinished(status):
@@ -179,7 +179,7 @@ class Publisher:
         self.schedule_status()
 
     def _receive_event(self, server: LocalConnection, message: JsonObject, line: bytes) -> None:
-        """Process an event. If a goal's state or the pause changed, publish it and schedule a status."""
+        """Process an event. If a goal or the pause has changed, publish the event and schedule a status."""
         event = from_json(message)
         if isinstance(event, StateChanged):
             self._update_goals(event)

@@ -114,7 +114,7 @@ class RemoteSessions:
             session.refuse(request, Busy.code, f"{self.name} already has {MAX_SESSIONS} remote clients")
 
     def handle_goodbye(self, user: str, reply_topic: str) -> None:
-        """After a client's goodbye, end its session once requests with a lasting effect are answered."""
+        """After a client's goodbye, end its session as soon as requests with a lasting effect are answered."""
         if session := self._sessions.get((user, reply_topic)):
             session.handle_goodbye()
 
@@ -138,7 +138,7 @@ class RemoteSessions:
                 session.send_alive()
 
     def _make_room(self, user: str, *, urgent: bool) -> bool:
-        """End a session if there are too many. Return whether there is room for a new session of a user.
+        """End a session if there are too many. Return whether there is room for a user's new session.
 
         Preferably, an idle session is ended. Otherwise, a user with few sessions takes the place of a user with many.
         For an `urgent` request, any session may be ended. A user with many sessions only gets places of users with at
@@ -171,7 +171,7 @@ class RemoteSessions:
         return sum(each.size_bytes for session in sessions for each in session.unanswered)
 
     def has_waiting(self, user: str) -> bool:
-        """Return whether goals of a user are waiting for room."""
+        """Return whether any of a user's goals are waiting for room."""
         return any(session.user == user for _, _, session in self.waiting)
 
     def cancel_waiting(self, cancel: Cancel, canceled_by: By | None) -> list[Goal]:
@@ -298,11 +298,11 @@ class RemoteSession:
 
     @property
     def idle(self) -> bool:
-        """Whether the client is neither waiting for answers or results nor watching the server."""
+        """Whether the client has no unanswered requests, awaits no results, and isn't watching the server."""
         return not (self.unanswered or self._awaited or self._watching)
 
     def submit(self, request: RemoteRequest) -> None:
-        """Send a request, after connecting to the server if necessary. Refuse excess requests."""
+        """Send a request, and connect to the server first if necessary. Refuse excess requests."""
         self.used_at = self._loop.time()
         if self._said_goodbye:  # the client has returned
             self._said_goodbye, self._reply_topic = False, request.reply_topic
@@ -324,7 +324,7 @@ class RemoteSession:
                 self._task = asyncio.create_task(self._run(urgent=urgent))
 
     def handle_goodbye(self) -> None:
-        """After the client's goodbye, end the session once requests with a lasting effect are answered.
+        """After the client's goodbye, end the session as soon as requests with a lasting effect are answered.
 
         The client gets no more answers, and its waiting goals are dropped.
         """
@@ -374,7 +374,7 @@ class RemoteSession:
         self._sessions.waiting = [each for each in self._sessions.waiting if each[2] is not self]
 
     def _end_if_done(self) -> None:
-        """End the session if its client has left and no request with a lasting effect is unanswered.
+        """End the session if its client has left and all requests with a lasting effect are answered.
 
         If `end` was called before the server was connected, close the connection.
         """
@@ -401,7 +401,7 @@ class RemoteSession:
             self._send(_RemoteExchange(remote_request, request))
 
     def send_say(self, remote_request: RemoteRequest, say: Say, *, ignore_limit: bool = False) -> None:
-        """Send a goal to the server. If too many are pending, let it wait or reject it.
+        """Send a goal to the server. If too many goals are pending, delay the goal or reject it.
 
         Args:
             remote_request: the client's request.

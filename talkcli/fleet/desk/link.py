@@ -137,7 +137,7 @@ class DeskLink:
         return self.process(await self._wait(watched, min(timeout, due - now), interrupt))
 
     def prepare(self, now: float) -> tuple[dict[int, int], float]:
-        """Connect, or keep the connection alive, without blocking. Return what to wait for.
+        """Connect, or keep the connection alive, without blocking. Return the descriptors and the time to wait for.
 
         Returns:
             The poll events by descriptor, and the monotonic time at which to call `process` even if nothing is ready.
@@ -253,13 +253,13 @@ class DeskLink:
         return topic(to, topics.REQUEST, self.user), response
 
     def wake(self) -> None:
-        """Let a thread or an event loop stop waiting for messages, and call `process`."""
+        """Wake the thread or the event loop that waits for messages, so that it calls `process`."""
         # Sending fails if the link is closed, or if the buffer is full because `wake` was called before.
         with contextlib.suppress(OSError):
             self._wake_writer.send(b"\0")
 
     async def flush(self, timeout: float) -> None:
-        """Wait until the broker has acknowledged all messages, but for at most `timeout` seconds."""
+        """Wait up to `timeout` seconds for the broker to acknowledge all messages."""
         end = time.monotonic() + timeout
         while self.link is not None and self.link.outstanding_bytes and (left := end - time.monotonic()) > 0:
             await self.poll(left)

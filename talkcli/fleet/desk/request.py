@@ -142,7 +142,7 @@ def reply_outcomes(robot: str, request: Request, reply: JsonObject, items: list[
 
 
 def cancel_outcomes(robot: str, items: list[JsonObject], *, last: bool = True) -> list[Outcome]:
-    """Return the outcomes of a cancel request: one for each goal that it cancelled or found ended.
+    """Return the outcomes of a cancel request: one for each goal that was cancelled or had already ended.
 
     Args:
         robot: the name of the robot.

@@ -255,7 +255,7 @@ class RobotConnection(Connection):
         self._send_now(self._token_request)
 
     def _send_waiting(self, error: TalkError | None) -> None:
-        """Send the requests that have waited for a token. If there is an error instead of a token, fail each `say`."""
+        """Send the requests that have waited for a token. If `error` is given, fail each `say` instead."""
         while self._awaiting_token:
             exchange = self._awaiting_token.popleft()
             request = exchange.request

@@ -208,7 +208,7 @@ class FleetRequestCalls:
         self._desk.close()
 
     async def _await_tokens(self) -> None:
-        """Wait until the sentence has been sent to all robots from which a token was requested, but not for long."""
+        """Wait briefly until the sentence has been sent to all robots whose tokens were requested."""
         end = time.monotonic() + _FLUSH_LIMIT_S
         while self._desk.link and any(each.connection.awaits_token for each in self._robots.values()):
             if (left := end - time.monotonic()) <= 0:
@@ -279,7 +279,7 @@ class FleetRequestCalls:
                 self._on_presence(robot, presence)
 
     def _on_presence(self, robot: RobotRequest, presence: Presence) -> None:
-        """Include a new robot, and send it the request if necessary. For others, record their ended goals.
+        """Include a new robot, and send it the request if necessary. For a known robot, record ended goals.
 
         Send the request if possible. After all retained messages have arrived, new robots are ignored, because they
         came online too late. Until then, every member of a group is expected to answer. Some members may have come
@@ -469,7 +469,7 @@ class RobotRequest:
             self._record(*reply_outcomes(self._name, request, reply, items))
 
     def _on_failure(self, error: TalkError) -> None:
-        """Record a failed request. First, record the goals that it cancelled anyway."""
+        """Record that the request has failed. First, record any goals that it cancelled nevertheless."""
         try:
             items = error.items if isinstance(error, UnknownGoal) else []
             self._record(*cancel_outcomes(self._name, items, last=False))

@@ -181,7 +181,7 @@ class FleetTranscript:
         return self._transcripts[name].lines(event, screen, now)
 
     def change_lines(self, before: Presence | None, robot: Presence, screen: Screen, now: float) -> list[str]:
-        """Describe in a line how a robot or its server has changed. Forget the robot's goals.
+        """Return a line that describes how a robot or its server has changed. Also forget the robot's goals.
 
         Args:
             before: the presence before the change, or None if the robot was unknown.

@@ -90,7 +90,7 @@ class BrokerAway:
 
 @frozen
 class BrokerBack:
-    """Reports that the broker is connected again. It was away for `after` seconds."""
+    """Reports that the broker is connected again, after an absence of `after` seconds."""
 
     after: float
 
@@ -216,7 +216,7 @@ class FleetWatch:
     # -- messages from the broker
 
     def on_connected(self, link: Link) -> None:
-        """Subscribe to the presence, the status and the events of the robots."""
+        """Subscribe to the robots' presence, status and events."""
         self._retained = []
         robot = (self._selection and self._selection.name) or topics.ANY
         link.subscribe(topics.robot(robot, topics.EVENT, topics.ANY), retained=False)
