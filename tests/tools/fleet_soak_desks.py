@@ -86,7 +86,7 @@ class Desks:
         self._robot, self._broker, self._ledger = robot, broker, ledger
         self.workers = Workers()
         kinds = [("library", self._use_library)] * 4 + [("command", self._use_command)] * 2
-        for number, (kind, use) in enumerate([*kinds, ("urgent", self._send_urgent_goals)]):
+        for number, (kind, use) in enumerate(kinds):
             name = f"{kind}-{number}"
             rng = random.Random(f"{seed} {name}")
             self.workers.start(name, lambda over, use=use, name=name, rng=rng: use(name, rng, over))  # type: ignore[misc]
@@ -100,12 +100,6 @@ class Desks:
                 if over.is_set() or connection.ended is not None:
                     break
                 self._follow(client, rng, over, earlier)
-
-    def _send_urgent_goals(self, name: str, rng: random.Random, over: threading.Event) -> None:
-        """Send goals that expire soon, which must not be spoken if they arrive late."""
-        for client, connection in self._connections(name, over):
-            while connection.ended is None and not over.wait(rng.uniform(0.5, 3)):
-                self._await_ends([self._say(client, {"preempt": True, "ttl": 0.2})], rng)
 
     def _connections(self, name: str, over: threading.Event) -> Iterator[tuple[Client, Connection]]:
         while not over.is_set():

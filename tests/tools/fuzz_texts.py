@@ -27,7 +27,6 @@ from typing import TYPE_CHECKING
 from unittest import mock
 
 from talkcli.engine import protocol
-from talkcli.engine.child.cutting import GrowingText
 from talkcli.engine.parent import process
 from talkcli.engine.parent.process import EngineFailed, PrivateEngine
 from talkcli.goals.options import bad_text
@@ -328,18 +327,6 @@ def speak_growing(engine: PrivateEngine, goal: str, case: Case, pieces: Sequence
     engine._process.send(protocol.Append(goal, "", end=True))
 
 
-def find_lost_text(text: str, pieces: Iterable[str], source: random.Random) -> str | None:
-    """Cut a text that grows by these pieces. Return an error message if text is lost."""
-    growing, now, parts = GrowingText("", ended=False), 0.0, []
-    for piece in (*pieces, ""):
-        growing.append(piece, now)
-        growing.ended = not piece
-        now += source.choice((0.0, 0.01, 0.11, 1.1))
-        while (part := growing.take_next_part(now, source.choice((0.0, 0.1, 5.0)))) is not None:
-            parts.append(text[slice(*part)])
-    return None if "".join("".join(parts).split()) == "".join(text.split()) else f"other parts: {parts}"
-
-
 def find_misplaced_word(text: str, words: Iterable[protocol.Word]) -> str | None:
     """Return an error message if a word of a goal is not in its place."""
     before = 0
@@ -357,13 +344,11 @@ def _speak_until_crash(texts: Iterator[Case], end: float, path: str, tally: Tall
         # At least one text is spoken, even if the start has used up the time.
         for number, case in enumerate(texts):
             tally.texts += 1
-            goal, wrong, words = f"f{number}", None, []
+            goal, words = f"f{number}", []
             try:
                 if growing:
                     source = random.Random(case.text)
-                    pieces = list(split(case.text, source))
-                    wrong = find_lost_text(case.text, pieces, source)
-                    speak_growing(engine, goal, case, pieces, source)
+                    speak_growing(engine, goal, case, list(split(case.text, source)), source)
                 else:
                     engine.speak(protocol.Speak(goal, case.text, _RATE, 1.0, case.voice, 50))
                 while not isinstance(event := next(engine.events), protocol.Ended):
@@ -377,7 +362,7 @@ def _speak_until_crash(texts: Iterator[Case], end: float, path: str, tally: Tall
                 return True
             outcome = ended.reason or ended.outcome
             tally.outcomes[outcome] += 1
-            wrong = wrong or find_misplaced_word(case.text, words)
+            wrong = find_misplaced_word(case.text, words)
             if ended.id != goal or outcome == "engine_failed" or wrong:
                 tally.faults.append(f"{wrong or ended}: {case.voice} {case.text!a}")
             with contextlib.suppress(FileNotFoundError):  # the text had no sound

@@ -41,7 +41,6 @@ class GoalMonitor:
         self._starts: defaultdict[str, dict[tuple[str, str], float]] = defaultdict(dict)
         #: number of ends by state and reason
         self.ends: Counter[tuple[str, str | None]] = Counter()
-        self.interruptions = 0
         self.faults: list[str] = []
         self.closed = False
         self._wire: Wire | None = None
@@ -129,7 +128,6 @@ class GoalMonitor:
             return
         with self._changed:
             goal_id, state = event["id"], event.get("state", "INTERRUPTED")
-            self.interruptions += state == "INTERRUPTED"
             if state != "REJECTED":  # a rejected goal may have the same id as another goal
                 self._check(goal_id, state)
                 if state in TERMINAL:

@@ -45,11 +45,8 @@ class Report:
     ends: Counter[tuple[str, str | None]]  # by state and reason
     faults: Counter[str]
     heard_whole: int = 0  # sentences
-    grown: Counter[tuple[str, str]] = field(default_factory=Counter)  # growing texts by what the client did
     #: interrupted texts by state, and whether they were interrupted
     stories: Counter[tuple[str, bool]] = field(default_factory=Counter)
-    interjections: Counter[str] = field(default_factory=Counter)  # by state
-    interruptions: int = 0  # of all goals
 
 
 class Soak:
@@ -75,7 +72,7 @@ class Soak:
         self._settle()
         before, files, known = usage.count(talk.pid), self._files(), Counter(monitor.ends)
         report = self._disturb(seconds, every, min_faults)
-        report.ends, report.interruptions = monitor.ends - known, monitor.interruptions
+        report.ends = monitor.ends - known
         lost = sum(
             count for (state, reason), count in report.ends.items() if state == "ABORTED" and reason in _ENGINE_REASONS
         )
@@ -97,13 +94,12 @@ class Soak:
         narrator = Narrator(self._talk, self._sink, faults.calm_since)
         clients.start("narrator", narrator.run)
         told: Counter[tuple[str, bool]] = Counter()
-        interjected: Counter[str] = Counter()
         # They have a high priority, so they would delay the warm-up.
         for number in range(_INTERJECTING_CLIENTS):
             rng = random.Random(f"{self._seed} stories {number}")
             clients.start(f"stories {number}", partial(tell_stories, self._talk, self._stories, told, rng))
             rng = random.Random(f"{self._seed} interjections {number}")
-            clients.start(f"interjections {number}", partial(interject, self._talk, interjected, rng))
+            clients.start(f"interjections {number}", partial(interject, self._talk, rng))
         end = time.monotonic() + seconds
 
         def over() -> bool:
@@ -117,17 +113,14 @@ class Soak:
                 faults.run(every, over)
         finally:
             clients.stop(f"after {faults.done}; last fault: {faults.last}")
-        return Report(Counter(), faults.done, narrator.heard_whole, self._grown, told, interjected)
+        return Report(Counter(), faults.done, narrator.heard_whole, told)
 
     def _start_senders(self, phase: str) -> Workers:
         workers = Workers()
-        self._grown: Counter[tuple[str, str]] = Counter()
         for number in range(_CLIENTS + _GROWING_CLIENTS):
             rng = random.Random(f"{self._seed} {phase} {number}")
-            send = partial(send_goals, self._talk)
-            if number >= _CLIENTS:
-                send = partial(send_growing_texts, self._talk, self._grown)
-            workers.start(f"client {number}", partial(send, rng))
+            send = send_goals if number < _CLIENTS else send_growing_texts
+            workers.start(f"client {number}", partial(send, self._talk, rng))
         return workers
 
     def _settle(self) -> None:

@@ -6,14 +6,12 @@ import itertools
 import time
 from typing import TYPE_CHECKING, Any
 
-from talkcli.server.speech import MAX_UNHEARD_CHARS
 from tests.support.watcher import TERMINAL
 from tests.tools.soak_clients import PATIENCE_S
 
 if TYPE_CHECKING:
     import random
     import threading
-    from collections import Counter
     from collections.abc import Callable
 
     from tests.support.connection import Message, Wire
@@ -34,17 +32,12 @@ _OPTIONS: tuple[dict[str, Any], ...] = (
 _numbers = itertools.count()
 
 
-def send_growing_texts(talk: Talk, ends: Counter[tuple[str, str]], rng: random.Random, over: threading.Event) -> None:
-    """Send texts in pieces. Each goal must end in time, with the right state.
-
-    `ends` counts the goals by what the client did at the end, and by the reason or the state.
-    """
+def send_growing_texts(talk: Talk, rng: random.Random, over: threading.Event) -> None:
+    """Send texts in pieces. Each goal must end in time, with the right state."""
     while not over.is_set():
         with talk.connect() as wire:
             while not over.is_set():
-                text = _GrowingText(talk, wire, rng, over)
-                usable = text.send()
-                ends[text.way, text.end] += 1
+                usable = _GrowingText(talk, wire, rng, over).send()
                 over.wait(rng.random())
                 if not usable or rng.random() < 0.1:
                     break
@@ -55,14 +48,14 @@ class _GrowingText:
 
     def __init__(self, talk: Talk, wire: Wire, rng: random.Random, over: threading.Event) -> None:
         self._talk, self._wire, self._rng, self._over = talk, wire, rng, over
-        self.way = rng.choice(["ended", *_WAYS])
+        self._way = rng.choice(["ended", *_WAYS])
         self._options = rng.choice(_OPTIONS) | {"more": True, "wait": True, "rate": 450, "stall": 1}
-        if self.way == "continued" or rng.random() < 0.3:
+        if self._way == "continued" or rng.random() < 0.3:
             self._options["id"] = f"grows/{next(_numbers)}"
         size, start = rng.choice((3, 5, 12)), rng.randrange(len(_STORY) - _LONGEST)
         places = range(start, start + rng.randrange(10, _LONGEST), size)
         self._begin, *self._pieces = [_STORY[at : at + size] for at in places]
-        self._id = self.end = ""
+        self._id = ""
         #: the text that the server has confirmed, and whether it has confirmed its end
         self._text, self._ended = self._begin, False
 
@@ -74,7 +67,7 @@ class _GrowingText:
             self._check(self._result())
             return True
         assert goal["state"] == "PENDING", goal
-        usable = all(map(self._append, self._pieces)) and _WAYS[self.way](self)
+        usable = all(map(self._append, self._pieces)) and _WAYS[self._way](self)
         self._check(self._result() if usable else self._status())
         if usable:
             reply = self._wire.request("append", id=self._id, text="too late")
@@ -85,17 +78,14 @@ class _GrowingText:
         """Add a piece, and return True."""
         if not self._over.is_set():
             time.sleep(self._rng.choice(_INTERVALS_S))
-        self._record(self._wire.request("append", id=self._id, text=text, at=len(self._text), **fields), text, fields)
-        return True
-
-    def _record(self, reply: Message, text: str, fields: dict[str, object]) -> None:
-        """Record what a reply confirms."""
+        reply = self._wire.request("append", id=self._id, text=text, at=len(self._text), **fields)
         if reply["ok"]:
             self._text += text
             self._ended = "end" in fields
             assert reply["length"] == len(self._text), reply
         else:
             assert reply["error"]["code"] == "goal_ended", reply
+        return True
 
     def _result(self) -> Message:
         """Return the goal when its result arrives."""
@@ -111,15 +101,14 @@ class _GrowingText:
             goal: Message = self._talk.request("status", id=self._id)["goal"]
             if goal["state"] in TERMINAL:
                 return goal
-            assert time.monotonic() < end, f"{goal}, {self.way}, has not ended: {self._talk.request('status')}"
+            assert time.monotonic() < end, f"{goal}, {self._way}, has not ended: {self._talk.request('status')}"
             time.sleep(0.05)
 
     def _check(self, goal: Message) -> None:
-        details = f"{self.way}, {len(self._text)} characters, {self._ended}: {goal}"
-        self.end = goal["reason"] or goal["state"]
+        details = f"{self._way}, {len(self._text)} characters, {self._ended}: {goal}"
         assert goal["state"] in TERMINAL, details
-        assert self.end != "nothing_to_say", details
-        assert self.end != "broken_off" or self.way in _BREAKS, details
+        assert goal["reason"] != "nothing_to_say", details
+        assert goal["reason"] != "broken_off" or self._way in _BREAKS, details
         assert (goal["text"], goal["more"], goal["waits"]) == (self._text, False, False), details
         assert (goal["spoken_end"] or 0) <= len(self._text), details
         assert goal["state"] != "SUCCEEDED" or (self._ended and goal["spoken_end"] == len(self._text)), details
@@ -138,11 +127,6 @@ class _GrowingText:
         self._wire.close()
         return False
 
-    def _half_close(self) -> bool:
-        self._wire.half_close()
-        self._check(self._result())
-        return False
-
     def _continue(self) -> bool:
         """Close the connection, and continue on another one, with the same first piece."""
         self._wire.close()
@@ -154,20 +138,6 @@ class _GrowingText:
             self._check(self._result())
         return False
 
-    def _exceed(self) -> bool:
-        """Add more than may be unheard, and cancel the goal before the reply comes."""
-        text = "long " * (MAX_UNHEARD_CHARS // 5 + 100)
-        self._wire.send({"seq": -1, "request": "append", "id": self._id, "text": text})
-        time.sleep(self._rng.random())
-        assert self._wire.request("cancel", ids=[self._id])["ok"]
-        items = self._wire.items
-        while not (replies := [each for each in items if each.get("seq") == -1]):
-            message = self._wire.receive()
-            (self._wire.events if "event" in message else items).append(message)
-        items.clear()
-        self._record(replies[0], text, {})
-        return True
-
 
 _WAYS: dict[str, Callable[[_GrowingText], bool]] = {
     "ended": lambda text: text._append(end=True),
@@ -176,9 +146,7 @@ _WAYS: dict[str, Callable[[_GrowingText], bool]] = {
     "cancelled": _GrowingText._cancel,
     "preempted": _GrowingText._preempt,
     "closed": _GrowingText._close,
-    "half-closed": _GrowingText._half_close,
     "continued": _GrowingText._continue,
-    "too much": _GrowingText._exceed,
 }
 #: What may break a text off.
-_BREAKS = frozenset({"broken off", "closed", "half-closed", "continued"})
+_BREAKS = frozenset({"broken off", "closed", "continued"})

@@ -99,8 +99,8 @@ def _check(goal: Message, words: list[tuple[int, int, int]], wanted: list[tuple[
         assert goal["spoken"] == goal["text"][: words[-1][2]], details
 
 
-def interject(talk: Talk, ends: Counter[str], rng: random.Random, over: threading.Event) -> None:
-    """Interrupt whatever is spoken. `ends` counts the interjections by their final state."""
+def interject(talk: Talk, rng: random.Random, over: threading.Event) -> None:
+    """Interrupt whatever is spoken."""
     with talk.connect() as wire:
         while not over.wait(rng.random() * 2):
             priority = rng.choice((_PRIORITY, _PRIORITY, _PRIORITY + 1))
@@ -110,6 +110,5 @@ def interject(talk: Talk, ends: Counter[str], rng: random.Random, over: threadin
                 assert wire.request("cancel", current=True)["ok"]
             elif rng.random() < 0.05:
                 assert wire.request("say", text="stop", preempt=True, priority=priority, rate=_RATE)["ok"]
-            while (ended := wire.receive_event("result", PATIENCE_S)["goal"])["id"] != goal["id"]:
+            while wire.receive_event("result", PATIENCE_S)["goal"]["id"] != goal["id"]:
                 pass
-            ends[ended["state"]] += 1

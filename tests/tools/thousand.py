@@ -182,12 +182,12 @@ def measure_broker(fleet: MeasuredFleet) -> None:
 def measure_memory(fleet: MeasuredFleet) -> None:
     goal, speaking = fleet.start_say(2, "--wait")
     fleet.await_spoken(goal)
-    _print("memory of a desk that waits for all", [megabytes(speaking.pid, "Pss")], "MB")
+    _print("memory of a desk that waits for all", [megabytes(speaking.pid)], "MB")
     fleet.finish(speaking)
-    _print("memory of the broker", [megabytes(fleet.broker.pid, "Pss")], "MB")
+    _print("memory of the broker", [megabytes(fleet.broker.pid)], "MB")
     with Bridge(fleet.real[fleet.real.names[0]].talk, fleet.broker, "measured", env=_NOT_FORKED) as bridge:
         bridge.await_online()
-        _print("memory of a bridge", [megabytes(bridge.pid, "Pss")], "MB")
+        _print("memory of a bridge", [megabytes(bridge.pid)], "MB")
         bridge.terminate()
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from talkcli.errors import TalkError
-from tests.tools.bench import fleet, growing, load, machine, marathon, processes, sound
+from tests.tools.bench import fleet, growing, load, machine, processes, sound
 from tests.tools.bench.harness import Harness, Options
 from tests.tools.bench.table import Row, as_table
 
@@ -26,7 +26,6 @@ the times depend on the machine and its load. The exit code is 1 if a row could 
 error.
 """
 GROUPS: dict[str, Callable[[Harness], list[Row]]] = {
-    "recorder": sound.recorder,
     "onset": sound.onset,
     "at-once": sound.at_once,
     "cancel": sound.cancel,
@@ -39,14 +38,12 @@ GROUPS: dict[str, Callable[[Harness], list[Row]]] = {
     "commands": processes.commands,
     "idle": processes.idle,
     "throughput": load.throughput,
-    "queue": load.queue,
     "crowd": load.crowd,
 }
 #: Groups that are only measured if they are named.
 NAMED: dict[str, Callable[[Harness], list[Row]]] = {
     "neural": sound.neural,
     "fleet": fleet.fleet,
-    "marathon": marathon.marathon,
 }
 
 
@@ -60,21 +57,18 @@ def measure(name: str, harness: Harness) -> list[Row]:
 
 def main() -> None:
     parser = argparse.ArgumentParser("python -m tests.tools.bench", description=_ABOUT)
-    names = f"{', '.join(GROUPS)}; {', '.join(NAMED)} (the last three only if they are named)"
+    names = f"{', '.join(GROUPS)}; {', '.join(NAMED)} (the last two only if they are named)"
     parser.add_argument("rows", nargs="*", metavar="ROW", help=names)
     parser.add_argument("--rounds", type=int, default=15, help="rounds of each row; some rows have more (%(default)s)")
     parser.add_argument(
         "--idle", type=float, default=60, metavar="SECONDS", help="time for idle processes (%(default)g)"
-    )
-    parser.add_argument(
-        "--sentences", type=int, default=10_000, help="number of sentences of the marathon (%(default)s)"
     )
     options = parser.parse_args()
     unknown = set(options.rows) - {*GROUPS, *NAMED}
     if unknown:
         parser.error(f"unknown rows: {', '.join(sorted(unknown))}")
     facts, started_at, rows = machine.describe(), time.monotonic(), []
-    with Harness(Options(options.rounds, options.idle, options.sentences)) as harness:
+    with Harness(Options(options.rounds, options.idle)) as harness:
         for name in options.rows or GROUPS:
             print(f"{name} …", file=sys.stderr, flush=True)
             rows += measure(name, harness)

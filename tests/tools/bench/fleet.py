@@ -35,7 +35,7 @@ _PATIENCE_S = 10.0
 
 
 def fleet(harness: Harness) -> list[Row]:
-    """Measure a robot with a broker without TLS, and compare it with a broker with TLS."""
+    """Measure a robot with a broker on the same machine."""
     rounds, seconds = harness.options.rounds * _MORE_ROUNDS, harness.options.idle
     with contextlib.ExitStack() as stack:
         talk, bridge, env = stack.enter_context(_robot())
@@ -50,15 +50,13 @@ def fleet(harness: Harness) -> list[Row]:
             local.cancel()  # so that the server is idle for the next command
             return seconds
 
-        say, status, cancel = (compare(action, local, desk) for action in (_time_say, _time_status, _time_cancel))
+        say, cancel = (compare(action, local, desk) for action in (_time_say, _time_cancel))
         later = harness.in_turn({"later": partial(_result_later, desk, local)}, rounds)["later"]
         commands = {"here": partial(command, ("say", "hi"), talk.env)}
         commands |= {"there": partial(command, ("--robot", _ROBOT, "say", "hi"), env)}
         whole = harness.in_turn(commands, rounds)
         switches = measure_use([bridge.pid], seconds).switches / seconds
-        memory = {kind: megabytes(bridge.pid, kind) for kind in ("Pss", "Rss")}
-        tls_desk = stack.enter_context(_connect(stack.enter_context(_robot(secure=True))[2]))
-        tls_say, tls_status = (compare(action, desk, tls_desk) for action in (_time_say, _time_status))
+        memory = megabytes(bridge.pid)
 
     def row(name: str, times: dict[str, list[float]], peer: str, *limits: Limit) -> Row:
         return Row(name, "ms", times["there"], peer, times["here"], limits)
@@ -67,22 +65,17 @@ def fleet(harness: Harness) -> list[Row]:
     return [
         row("`Client.say()` at a desk → accepted", say, _ON_ROBOT, Limit("median", 10)),
         Row("result at a client on the robot → at the desk", "ms", later, limits=(Limit("median", 5),)),
-        row("`Client.status()` at a desk", status, _ON_ROBOT),
         row("`GoalHandle.cancel()` at a desk, of the active goal", cancel, _ON_ROBOT),
         row(f"`talk --robot {_ROBOT} say hi`", whole, "`talk say hi`"),
         Row(f"{where}: context switches of the bridge per second", "/s", [switches], limits=(Limit("median", 2),)),
-        Row("memory of the bridge (Pss)", "MB", [memory["Pss"]], limits=(Limit("median", 25),)),
-        # This includes libraries that it shares with other programs, such as libssl and libpython.
-        Row("… with shared memory (Rss)", "MB", [memory["Rss"]]),
-        row("`Client.say()` at a desk with TLS → accepted", tls_say, "without"),
-        row("`Client.status()` at a desk with TLS", tls_status, "without"),
+        Row("memory of the bridge (Pss)", "MB", [memory], limits=(Limit("median", 25),)),
     ]
 
 
 @contextlib.contextmanager
-def _robot(*, secure: bool = False) -> Iterator[tuple[Talk, Bridge, dict[str, str]]]:
+def _robot() -> Iterator[tuple[Talk, Bridge, dict[str, str]]]:
     """Run a broker and a robot. Yield the robot's server, its bridge, and the environment of a desk."""
-    with Broker(secure=secure) as broker, serving("--player", "null") as talk, Bridge(talk, broker, _ROBOT) as bridge:
+    with Broker() as broker, serving("--player", "null") as talk, Bridge(talk, broker, _ROBOT) as bridge:
         bridge.await_online()
         with Desk(broker, user="desk", password=False) as desk:
             yield talk, bridge, desk.env
@@ -99,12 +92,6 @@ def _time_say(client: Client) -> float:
     seconds = time.monotonic() - started_at
     goal.cancel()
     return seconds
-
-
-def _time_status(client: Client) -> float:
-    started_at = time.monotonic()
-    client.status()
-    return time.monotonic() - started_at
 
 
 def _time_cancel(client: Client) -> float:

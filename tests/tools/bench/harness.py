@@ -1,7 +1,7 @@
 """The programs that all rows share, and measurements of the time from an action to sound or silence.
 
 All times are monotonic. A null sink renders one block ahead, so a sound may seem to be one block (2 ms) too early. The
-recorder adds the same delay to talk and its peers, which its own row shows.
+recorder adds less than 1 ms.
 """
 
 from __future__ import annotations
@@ -50,11 +50,10 @@ _MIN_CORRELATION = 0.7
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """The number of rounds per row, the seconds for idle processes, and the number of sentences of the marathon."""
+    """The number of rounds per row, and the seconds for idle processes."""
 
     rounds: int = 15
     idle: float = 60.0
-    sentences: int = 10_000
 
 
 class Harness(contextlib.ExitStack):
@@ -170,11 +169,9 @@ class Harness(contextlib.ExitStack):
 
 
 @contextlib.contextmanager
-def serving(
-    *options: str, sink: Sink | None = None, scripted: bool = False, program: str | None = None
-) -> Iterator[Talk]:
+def serving(*options: str, sink: Sink | None = None, scripted: bool = False) -> Iterator[Talk]:
     """Run a server during the block. Yield it when its engine is ready."""
-    talk = Talk(options, sink=sink, scripted=scripted, program=program, watched=False, forked=False)
+    talk = Talk(options, sink=sink, scripted=scripted, watched=False, forked=False)
     try:
         assert talk.request("voices", timeout=20)["ok"]
         yield talk

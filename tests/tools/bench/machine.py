@@ -86,10 +86,10 @@ def settle(pids: Iterable[int]) -> None:
             return
 
 
-def megabytes(pid: int, kind: str) -> float:
-    """Return the memory of a process. "Rss" is all memory. "Pss" counts only its share of shared memory."""
+def megabytes(pid: int) -> float:
+    """Return the memory of a process, with its share of shared memory (Pss)."""
     with open(f"/proc/{pid}/smaps_rollup", encoding="utf-8") as file:
-        return next(int(line.split()[1]) for line in file if line.startswith(f"{kind}:")) / 1024
+        return next(int(line.split()[1]) for line in file if line.startswith("Pss:")) / 1024
 
 
 def _seconds(task: str) -> float:

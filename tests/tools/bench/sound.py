@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import signal
 import subprocess
 import time
 from functools import partial
@@ -21,7 +20,7 @@ from tests.support.recording import LOUD
 from tests.support.reference import render
 from tests.support.surroundings import short_directory
 from tests.support.usage import descendants
-from tests.tools.bench.harness import PYTHON, SHORT, TALK, VOICED, finish, serving
+from tests.tools.bench.harness import PYTHON, SHORT, TALK, VOICED, serving
 from tests.tools.bench.machine import megabytes
 from tests.tools.bench.table import Limit, Row
 
@@ -34,8 +33,6 @@ if TYPE_CHECKING:
 #: Text for `onset`. Its first 11 ms are quiet.
 TEXT = "battery low"
 _PYTTSX3 = f"import pyttsx3; engine = pyttsx3.init(); engine.say({TEXT!r}); engine.runAndWait()"
-#: Length of the tone for `recorder`.
-_TONE_S = 0.6
 #: Factor for a cancel on an open connection, because its 99th percentile has a limit.
 _MORE_ROUNDS = 7
 #: Sentences without pauses as long as those between sentences.
@@ -58,24 +55,6 @@ _LOADED_MB, _AFTER_TEXTS_MB = 260, 340
 _TEXTS, _LONG_TEXT_LIMIT_S = 10, 600.0
 
 
-def recorder(harness: Harness) -> list[Row]:
-    """Measure the recorder's own delay with a killed player, whose sound ends within a millisecond."""
-    tone = 9000 * np.sin(np.arange(int(_TONE_S * RATE)) * (2 * np.pi * 441 / RATE))
-    command = _player(harness, "tone", tone)
-    playing: list[subprocess.Popen[bytes]] = []
-
-    def play() -> Callable[[], object]:
-        playing[:] = [harness.start(command)]
-        return partial(finish, playing[0], -signal.SIGKILL)
-
-    def kill() -> Callable[[], object]:
-        playing[0].kill()
-        return int
-
-    times = harness.in_turn({"killed": partial(harness.until_silence, play, kill)})
-    return [Row("SIGKILL of `aplay`, which plays a tone → silence", "ms", times["killed"])]
-
-
 def onset(harness: Harness) -> list[Row]:
     """Measure all ways to speak a text."""
     with _lines(harness) as line:
@@ -83,7 +62,6 @@ def onset(harness: Harness) -> list[Row]:
             "talk say -w": harness.command(TALK, "say", "-w", "--", TEXT),
             "Client.say": partial(_say_whole, harness.client, TEXT),
             "--lines": line,
-            "aplay": harness.command(*_player(harness, "rendering", render([TEXT])[0])),
         }
         if harness.has_peers:
             subjects["spd-say -w"] = harness.command("spd-say", "-w", TEXT)
@@ -100,7 +78,6 @@ def onset(harness: Harness) -> list[Row]:
         row("start of `talk say -w`", "talk say -w", "espeak-ng"),
         row("line into a running `talk say --lines`", "--lines", "spd-say -w", Limit("ratio", 0.6)),
         row("`Client.say()`", "Client.say", "spd-say -w", Limit("ratio", 0.25), Limit("median", 5)),
-        row("start of `aplay` with a finished file", "aplay", "spd-say -w"),
     ]
 
 
@@ -218,12 +195,12 @@ def neural(harness: Harness) -> list[Row]:
         await_voice(talk.socket, REAL_VOICE)
         (engine,) = descendants(talk.pid)
         name, limit = "memory of the engine process with joe (Pss)", Limit("median", _LOADED_MB)
-        rows.append(Row(name, "MB", [megabytes(engine, "Pss")], limits=(limit,)))
+        rows.append(Row(name, "MB", [megabytes(engine)], limits=(limit,)))
         with Client(talk.socket) as client:
             for _ in range(_TEXTS):
                 assert client.say(LONG_TEXT).wait(_LONG_TEXT_LIMIT_S).state is State.SUCCEEDED
         name, limit = f"… after {_TEXTS} texts of {len(LONG_TEXT):,} characters", Limit("median", _AFTER_TEXTS_MB)
-        rows.append(Row(name, "MB", [megabytes(engine, "Pss")], limits=(limit,)))
+        rows.append(Row(name, "MB", [megabytes(engine)], limits=(limit,)))
     return rows
 
 
@@ -284,14 +261,6 @@ def _pauses(harness: Harness, expected: Sequence[Samples], say: Callable[[str], 
     lengths = [len(samples) for samples in expected]
     own = [length - end + start for length, ((_, end), (start, _)) in zip(lengths, pairwise(sounds), strict=False)]
     return [1000 * (end - start - quiet) / RATE for (start, end), quiet in zip(pauses, own, strict=True)]
-
-
-def _player(harness: Harness, name: str, samples: Samples) -> list[str]:
-    """Write samples to a file with this name, and return the command that plays it."""
-    path = f"{harness.sink.directory}/{name}"
-    with open(path, "wb") as file:
-        file.write(samples.astype("<i2").tobytes())
-    return ["aplay", "-q", "-t", "raw", "-f", "S16_LE", "-r", str(RATE), "-c", "1", path]
 
 
 @contextlib.contextmanager
