@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-import talkcli
 from talkcli import Client, GoalHandle, PausedChanged, Result, Snapshot, State, StateChanged, WordHeard
-from talkcli.errors import Lost, UnknownGoal, UsageError
+from talkcli.errors import Lost, UnknownGoal
 from talkcli.goals.goal import By, Goal, Sender
 from talkcli.goals.states import TRANSITIONS
 from talkcli.protocol import events
@@ -81,13 +80,6 @@ def test_an_unknown_kind_of_event_is_parsed_as_none() -> None:
     for kind in ("alive", None, ["state"]):
         assert events.from_json({"event": kind}) is None
     assert events.from_json({"ok": True}) is None
-
-
-def test_the_package_exports_every_name_in_all() -> None:
-    for name in talkcli.__all__:
-        assert getattr(talkcli, name)
-    with pytest.raises(AttributeError, match="Speaker"):
-        _ = talkcli.Speaker
 
 
 def summary(events: list[Event]) -> list[object]:
@@ -209,31 +201,18 @@ def test_poll_never_waits(client: Client, scripted: Talk) -> None:
     waiting.join(5)
 
 
-def test_poll_of_a_goal_that_is_not_followed_is_an_error(client: Client) -> None:
-    handle = client.say("length=0.1", follow=False)
-    with pytest.raises(UsageError, match=rf"{handle.id}.*follow=False"):
-        handle.poll()
-    handle.events()
-    assert summary(polled(handle))[-1] is Result
-
-
-@pytest.mark.parametrize("how", ["killed", "frozen"])
-def test_poll_returns_the_result_of_a_lost_goal(scripted: Talk, monkeypatch: pytest.MonkeyPatch, how: str) -> None:
+def test_poll_returns_the_result_of_a_goal_of_a_frozen_server(scripted: Talk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("talkcli.client.core.SILENCE_LIMIT_S", 0.2)
     started_at = time.monotonic()
-    with Client(scripted.socket, timeout=0.5) as client:
+    with Client(scripted.socket, timeout=0.3) as client:
         handle = client.say("never-ends words=1")
-        if how == "killed":
-            scripted.kill()
-        else:
-            monkeypatch.setattr("talkcli.client.core.SILENCE_LIMIT_S", 0.3)
-            scripted.freeze()
+        scripted.freeze()
         assert summary(polled(handle))[-1] is Result
         assert (handle.state, handle.goal.reason, handle.poll()) == (State.LOST, "lost", None)
-        if how == "frozen":
-            assert time.monotonic() - started_at >= 0.8
-            assert "nothing for 0.3 s" in (handle.goal.message or "")
-            scripted.thaw()
-            scripted.run("cancel")
+        assert time.monotonic() - started_at >= 0.5
+        assert "nothing for 0.2 s" in (handle.goal.message or "")
+        scripted.thaw()
+        scripted.run("cancel")
 
 
 def until_all_ended(watch: Iterator[Event], count: int) -> list[Event]:
@@ -301,7 +280,7 @@ def check_events(events: list[Event], handle: GoalHandle) -> None:
 
 def test_eight_threads_can_say_follow_wait_and_cancel_at_once(make_talk: MakeTalk) -> None:
     talk = make_talk("--max-queue", "1000", scripted=True)
-    turns, count = 12, 8
+    turns, count = 6, 8
     handles: list[GoalHandle] = []
 
     with Client(talk.socket) as client:
@@ -342,7 +321,7 @@ def test_threads_share_the_events_of_one_goal(scripted: Talk) -> None:
     """One of the threads gets each event. All threads get the result."""
     with Client(scripted.socket) as client:
         words = " ".join(map(str, range(200)))
-        handle = client.say(f"length=0.5 {words}", feedback=True)
+        handle = client.say(f"length=0.2 {words}", feedback=True)
         taken: list[list[Event]] = [[] for _ in range(4)]
         run_all([lambda part=part: part.extend(handle.events(30)) for part in taken])  # type: ignore[misc]
         assert [part[-1] for part in taken] == [Result(handle.goal)] * 4

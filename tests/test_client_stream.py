@@ -113,10 +113,10 @@ def test_a_write_waits_while_much_is_unheard(client: Client) -> None:
     with client.stream() as speech:
         assert speech.write(LONG[:10_000])  # in a single piece
         assert speech.goal
-        threading.Timer(0.5, speech.goal.request_cancel).start()
+        threading.Timer(0.2, speech.goal.request_cancel).start()
         started_at = time.monotonic()
         assert not speech.write(LONG[10_000:])
-        assert time.monotonic() - started_at > 0.4
+        assert time.monotonic() - started_at > 0.1
     assert ended(speech)[0] is State.PREEMPTED
 
 
@@ -137,16 +137,17 @@ def test_the_goal_is_lost_if_the_server_was_restarted(soundless: Talk, client: C
     assert ended(speech)[0] is State.LOST
 
 
-def test_a_write_fails_if_the_server_is_gone(soundless: Talk, client: Client) -> None:
-    with client.stream() as speech:
-        assert speech.write("One. ")
-        soundless.kill()
-        with pytest.raises(Lost, match="the sentence may still be spoken"):
-            speech.write("Two. ")
-    assert ended(speech)[0] is State.LOST
-    with pytest.raises(ServerUnavailable), client.stream() as speech:
-        speech.write("One. ")
-    assert speech.goal is None
+def test_a_write_fails_if_the_server_is_gone(soundless: Talk) -> None:
+    with Client(soundless.socket, timeout=0.3) as client:
+        with client.stream() as speech:
+            assert speech.write("One. ")
+            soundless.kill()
+            with pytest.raises(Lost, match="the sentence may still be spoken"):
+                speech.write("Two. ")
+        assert ended(speech)[0] is State.LOST
+        with pytest.raises(ServerUnavailable), client.stream() as speech:
+            speech.write("One. ")
+        assert speech.goal is None
 
 
 @pytest.mark.parametrize(

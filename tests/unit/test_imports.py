@@ -17,7 +17,6 @@ import talkcli
 from talkcli.cli.commands import COMMANDS
 from talkcli.engine.players import PLAYERS
 from talkcli.engine.voices import SYNTHESIZERS
-from tests.support.surroundings import needs
 
 PACKAGE = Path(talkcli.__file__).parent
 
@@ -48,8 +47,6 @@ FOR_GOALS = {
     *("__future__", "bisect", "collections", "dataclasses", "enum", "hashlib", "itertools", "json", "math", "operator"),
     *("typing", "unicodedata", "talkcli.errors", "talkcli.frozen"),
 }
-#: The files and folders at the top of the project, except hidden ones.
-TOP = {"pyproject.toml", "talkcli", "tests", "completions", "README.md", "CHANGELOG.md", "LICENSE"}
 #: Libraries, and the layers or modules that may import them.
 ALLOWED = {
     "pyttsx3": {"engine"},
@@ -160,15 +157,6 @@ def test_no_module_imports_a_layer_above_it_even_for_types() -> None:
     for module in sources().keys() - FACE:
         above = {name for name, _ in inside(module) if name not in FACE and layer(name) > layer(module)}
         assert not above, f"talkcli.{module} imports {above} from a layer above"
-
-
-def test_the_project_has_only_the_listed_top_level_entries() -> None:
-    needs("git")
-    listed = subprocess.run(["git", "ls-files"], cwd=PACKAGE.parent, capture_output=True, text=True, check=False)
-    if listed.returncode:
-        pytest.skip("not a git checkout")
-    top = {path.strip('"').partition("/")[0] for path in listed.stdout.splitlines()}
-    assert {name for name in top if not name.startswith(".")} == TOP
 
 
 def test_every_module_is_used() -> None:
@@ -319,65 +307,6 @@ def test_a_client_imports_no_slow_modules(statement: str, without: list[str]) ->
         [sys.executable, "-c", code], cwd=PACKAGE.parent, capture_output=True, text=True, timeout=60, check=False
     )
     assert (done.returncode, done.stdout.split(), done.stderr) == (0, [], "")
-
-
-#: The doctor's modules that judge facts. All except the last one also gather facts.
-JUDGING = ["voice", "sound", "server", "sentence", "broker", "report"]
-#: Other modules that the doctor's judgements may use. They may also format times.
-FOR_JUDGING = {
-    *("talkcli.engine.players", "talkcli.fleet.payloads", "talkcli.goals.goal", "talkcli.goals.options"),
-    *("talkcli.goals.states", "talkcli.goals.reasons", "talkcli.terminal.goals", "talkcli.terminal.text"),
-    "talkcli.frozen",
-}
-
-
-@cache
-def sources_of_names(module: str) -> dict[str, str]:
-    """Return the names that a module imports at its top, and the modules that they come from."""
-    origins: dict[str, str] = {}
-    for node in sources()[module].body:
-        if isinstance(node, ast.Import):
-            origins |= {alias.asname or alias.name: alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            origins |= {alias.asname or alias.name: node.module or "" for alias in node.names}
-    return origins
-
-
-def global_names(function: ast.FunctionDef) -> set[str]:
-    """Return the names in a function that are neither its arguments nor its variables."""
-    names = [node for node in ast.walk(function) if isinstance(node, ast.Name)]
-    own = {node.arg for node in ast.walk(function) if isinstance(node, ast.arg)}
-    own |= {node.id for node in names if isinstance(node.ctx, ast.Store)}
-    return {node.id for node in names} - own
-
-
-def test_the_doctors_judgements_do_no_io() -> None:
-    """The same modules also gather facts, so the test follows each judgement through all functions that it calls."""
-    functions = {
-        (module, node.name): node
-        for module, tree in sources().items()
-        if part(module) == "doctor"
-        for node in tree.body
-        if isinstance(node, ast.FunctionDef)
-    }
-    new = {key for key in functions if key[1].startswith("judge") or key[0] == "doctor.report"}
-    assert {module for module, _ in new} == {f"doctor.{name}" for name in JUDGING}
-    judging: set[tuple[str, str]] = set()
-    while new:
-        judging |= new
-        called = set()
-        for module, name in new:
-            function = functions[module, name]
-            assert not any(isinstance(node, ast.Import | ast.ImportFrom) for node in ast.walk(function)), name
-            for used in global_names(function):
-                source = sources_of_names(module).get(used, f"talkcli.{module}")
-                owner = (source.removeprefix("talkcli."), used)
-                if owner in functions:
-                    called.add(owner)
-                elif source != f"talkcli.{module}" and part(owner[0]) != "doctor" and not used.lstrip("_").isupper():
-                    pure = source in FOR_JUDGING or source.partition(".")[0] not in (IMPURE | {"talkcli"}) - {"time"}
-                    assert pure or used == "__version__", f"talkcli.{module}: {name} uses {used} from {source}"
-        new = called - judging
 
 
 def test_contributing_names_every_file_that_handles_an_option() -> None:

@@ -64,21 +64,3 @@ def test_only_the_server_imports_the_scheduler() -> None:
 @pytest.mark.parametrize("path", users(), ids=lambda path: path.name)
 def test_no_module_outside_goals_writes_to_the_schedulers_state(path: Path) -> None:
     assert writes(path.read_text("utf-8")) == []
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "self._scheduler.settings = replace(self._scheduler.settings, ttl=1)",
-        "scheduler.active.paused = True",
-        "record.reason = None",
-        "del self.speech.scheduler.active",
-        "active.spoken_end += 1",
-        "speech.scheduler.voices.request('piper/joe', now)",
-        "self._scheduler.pending.remove(record)",
-        "scheduler.recent.add(record)",
-        "setattr(record, 'state', state)",
-    ],
-)
-def test_a_write_is_detected(line: str) -> None:
-    assert writes(line)

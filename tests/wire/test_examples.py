@@ -164,7 +164,7 @@ def test_the_loop_of_a_robot_handles_an_aborted_goal(
 ) -> None:
     """The loop cancels a goal that is no longer needed, and flashes the lights if the goal is lost."""
     example = only(README, "python", "Use it from Python", "robot.drives").replace("please let me pass", "never-ends")
-    example = example.replace("Client(name", "Client(timeout=1, name")
+    example = example.replace("Client(name", "Client(timeout=0.3, name")
     robot = ROBOT.replace("self.lips.append(word)", on_word.format(pid=scripted.pid))
     robot = robot.replace('raise SystemExit("nobody heard it")', lights)
     scripted.unfinished = state is None
