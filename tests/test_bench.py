@@ -11,7 +11,7 @@ from tests.support.documents import BENCHMARK, README, tables
 from tests.support.real_voice import real_voice
 from tests.support.sink import PROGRAMS
 from tests.support.surroundings import needs, needs_packages
-from tests.tools.bench import growing, load, sound
+from tests.tools.bench import fleet, growing, load, processes, sound
 from tests.tools.bench.__main__ import GROUPS, NAMED, measure
 from tests.tools.bench.harness import TALK, Harness, Options
 
@@ -44,6 +44,7 @@ def test_every_row_of_a_group_measures_something(harness: Harness, group: str, m
     for module, name, smaller in (
         *((load, "GOALS", 200), (load, "CLIENTS", 20)),
         (growing, "TOKENS", 100),
+        *((module, "_MORE_ROUNDS", 1) for module in (fleet, growing, processes, sound)),
         *((sound, "LONG_TEXT", sound.LONG_TEXT[:50]), (sound, "_TEXTS", 1)),
     ):
         monkeypatch.setattr(module, name, smaller)

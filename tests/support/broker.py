@@ -12,13 +12,7 @@ from typing import TYPE_CHECKING
 from tests.support.certificates import authority
 from tests.support.ports import HOST, Port
 from tests.support.resources import Resource
-from tests.support.surroundings import (
-    clean_environment,
-    dying_with_parent,
-    find_program,
-    needs,
-    short_directory,
-)
+from tests.support.surroundings import clean_environment, dying_with_parent, find_program, needs, short_directory
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -94,13 +88,7 @@ class Broker(Resource):
         return f"mqtts://localhost:{port}" if self.secure else f"mqtt://{HOST}:{port}"
 
     def env(self, user: str | None = None, password: str | bool = True, cert: str | None = None) -> dict[str, str]:
-        """Return the environment variables of a client.
-
-        Args:
-            user: Name of the user.
-            password: True for the user's own password, False for none.
-            cert: Name in the client's certificate.
-        """
+        """Return the environment variables of a client. `password` is True for the user's own one, False for none."""
         result = {"TALK_BROKER": self.url}
         if self.secure:
             result["TALK_MQTT_CA"] = authority().file

@@ -162,12 +162,7 @@ class Talk(Resource, Clients):
         watched: bool = True,
         forked: bool = True,
     ) -> None:
-        """Start the server.
-
-        Args:
-            program: Python program to run instead of `talk serve`.
-            forked: Fork the server if possible. Then /proc shows another command line.
-        """
+        """Start the server. It may be forked, and `program` is a Python program to run instead of `talk serve`."""
         super().__init__()
         self.unfinished: Collection[str] | bool = False
         self._mark = uuid.uuid4().hex

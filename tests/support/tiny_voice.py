@@ -81,16 +81,9 @@ def model(
 ) -> bytes:
     """Return a model that plays a square wave.
 
-    Args:
-        hop: Samples per frame.
-        period: Samples per period of the wave.
-        amplitude: Part of full scale, or NaN for a sound that isn't numbers. Each further speaker is a little louder.
-        sound_frames: Frames per phoneme.
-        sounds: Number of phonemes.
-        nodes: More nodes of the graph.
-        weights: More weights of the graph.
-        fields: More fields of the model.
-        cut: Name of the weight at which talk splits the model.
+    A frame has `hop` samples, a period of the wave has `period` samples, and each of the `sounds` phonemes has
+    `sound_frames` frames. Each further speaker is a little louder. `nodes`, `weights` and `fields` are added to the
+    model, and `cut` is the name of the weight at which talk splits it.
     """
     frames = [BLANK_FRAMES, *([sound_frames] * (sounds - 1))]
     wave = [amplitude if place % period < period / 2 else -amplitude for place in range(hop)]

@@ -104,8 +104,7 @@ class Watcher:
     def check(self, unfinished: Collection[str] | bool = False) -> None:
         """Assert that `n` always grows, and that each goal has one terminal event and no later events.
 
-        Args:
-            unfinished: Ids of goals that may have no terminal event, or True for all.
+        `unfinished` contains the goals that may have no terminal event. True means all goals.
         """
         numbers = [event["n"] for event in self.events() if "n" in event]
         assert numbers == sorted(set(numbers)), f"event numbers do not grow: {numbers}"

@@ -38,16 +38,9 @@ def wav(
     extensible: bool = False,
     length: int | None = None,
 ) -> bytes:
-    """Return a WAV file. With two channels, the second one is silent.
+    """Return a WAV file with samples from -1 to 1. With two channels, the second one is silent.
 
-    Args:
-        samples: the samples, from -1 to 1.
-        rate: samples per second.
-        bits: bits per sample.
-        channels: the number of channels.
-        number: the number of the format.
-        extensible: whether the header is an extensible one.
-        length: the length of the samples in the header, or None for the real one.
+    `number` is the number of the format, and `length` is the length of the samples in the header.
     """
     size = (bits + 7) // 8
     if number == FLOAT:

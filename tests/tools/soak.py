@@ -63,11 +63,11 @@ class Soak:
             self._stories = read_stories(wire)
         self._monitor = stack.enter_context(contextlib.closing(GoalMonitor(self._talk.socket)))
 
-    def run(self, seconds: float, every: float | None, min_faults: int) -> Report:
+    def run(self, seconds: float, every: float | None, min_faults: int, warm_up: int) -> Report:
         """Warm up, inject faults, and check their effects."""
         talk, monitor = self._talk, self._monitor
         senders = self._start_senders("warm-up")
-        assert monitor.wait_for(_WARM_UP_GOALS, _WARM_UP_LIMIT_S), f"only {monitor.ended} goals in the warm-up"
+        assert monitor.wait_for(warm_up, _WARM_UP_LIMIT_S), f"only {monitor.ended} goals in the warm-up"
         senders.stop()
         self._settle()
         before, files, known = usage.count(talk.pid), self._files(), Counter(monitor.ends)
@@ -141,14 +141,21 @@ class Soak:
         }
 
 
-def soak(seconds: float, seed: int, every: float | None = 5.0, player: str = "aplay", min_faults: int = 0) -> Report:
+def soak(
+    seconds: float,
+    seed: int,
+    every: float | None = 5.0,
+    player: str = "aplay",
+    min_faults: int = 0,
+    warm_up: int = _WARM_UP_GOALS,
+) -> Report:
     """Run a soak test until the time is over and there were enough faults.
 
-    If `every` is None, the only fault is a killed engine.
+    If `every` is None, the only fault is a killed engine. `warm_up` is the number of goals that end before.
     """
     print(f"seed {seed}", flush=True)
     with contextlib.ExitStack() as stack:
-        return Soak(seed, player, stack).run(seconds, every, min_faults)
+        return Soak(seed, player, stack).run(seconds, every, min_faults, warm_up)
 
 
 def assert_no_bug(*logs: str) -> None:

@@ -294,7 +294,7 @@ def first_error(steps: list[str]) -> BaseException | None:
 
 
 @settings(
-    max_examples=12 * settings().max_examples,  # errors that need a combination of three options are rare
+    max_examples=24 * settings().max_examples,  # errors that need a combination of three options are rare
     phases=[Phase.explicit, Phase.generate],
     suppress_health_check=[HealthCheck.too_slow],  # a busy machine must not fail the test
 )
