@@ -233,8 +233,8 @@ def _pause_fault(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
 
 
 def _bridge_fault(values: Mapping[str, Any], _: frozenset[str]) -> str | None:
-    """Return an error message if `bridge` has neither --name nor --print-acl."""
-    if values["name"] is None and not values["print_acl"]:
+    """Return an error message if `bridge` has neither --name nor an option that prints access rules."""
+    if values["name"] is None and not (values["print_acl"] or values["print_addon_acl"]):
         return "--name is missing; choose the robot's name on the broker, as in: talk bridge --name anna"
     return None
 
@@ -573,6 +573,7 @@ _ROWS = (
             option("--homeassistant", FLAG, "Show the robot as a device in Home Assistant."),
             _print_unit_option("user", "system"),
             option("--print-acl", FLAG, "Print access rules for mosquitto's acl_file, and exit."),
+            option("--print-addon-acl", FLAG, "Print access rules for Home Assistant's Mosquitto add-on, and exit."),
         ),
         rule=_bridge_fault,
     ),

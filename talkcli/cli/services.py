@@ -101,7 +101,7 @@ def _warn_about_sound(player: str, driver: str | None) -> None:
         note(f"{printable(str(error))}; nothing can be heard{hint}")
 
 
-def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **given: Any) -> int:
+def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, print_addon_acl: bool, **given: Any) -> int:
     """Run the bridge, or print its systemd unit or the broker's access rules.
 
     Return the exit code.
@@ -115,8 +115,9 @@ def bridge(options: CommonOptions, print_unit: str | None, print_acl: bool, **gi
         fault = None if name is None else topics.name_fault(name)
         if fault:
             raise UsageError(f"{flag}: '{printable(name)}' is not a valid name; it {fault}")
-    if print_acl:
-        show(topics.access_rules(homeassistant=given["homeassistant"], name=given["name"]))
+    if print_acl or print_addon_acl:
+        homeassistant = given["homeassistant"]
+        show(topics.access_rules(homeassistant=homeassistant, addon=print_addon_acl, name=given["name"]))
         return EXIT_OK
     for each in allow:
         if each not in ALLOWABLE_REQUESTS:

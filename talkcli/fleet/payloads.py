@@ -3,9 +3,9 @@
 Rules for this file: no I/O. Any client of the broker may have written a received payload, so invalid fields are treated
 as missing.
 
-Rules for `homeassistant_device`: use only keys that Home Assistant documents, and values from presence or status. Write
-templates that mean the same in Jinja and in Python, because tests evaluate them in Python. Never rename a component,
-because Home Assistant would treat it as a new one.
+Rules for `homeassistant_device`: use only keys that Home Assistant documents, and values from presence, status or
+events. Write templates that mean the same in Jinja and in Python, because tests evaluate them in Python. Never rename a
+component, because Home Assistant would treat it as a new one.
 """
 
 from __future__ import annotations
@@ -174,6 +174,31 @@ _AVAILABLE = "{{ 'online' if value_json.online and value_json.server else 'offli
 _STATE_TEMPLATE = "{{ 'paused' if value_json.paused else 'speaking' if value_json.active else 'idle' }}"
 _SPEAKING_TEMPLATE = "{{ 'ON' if value_json.active and not value_json.paused else 'OFF' }}"
 _LAST_TEMPLATE = "{{ value_json.last.state if value_json.last else None }}"
+_PAUSED_TEMPLATE = "{{ 'ON' if value_json.paused else 'OFF' }}"
+#: Names of all end states.
+_END_STATES = [each.name for each in EXIT_CODES]
+#: Maximum length of a text in an event. Home Assistant doesn't record events with more than 16 KiB.
+_MAX_EVENT_TEXT_CHARS = 1_000
+#: Template that turns a `state` event into an event of Home Assistant if the goal has ended. Home Assistant ignores an
+#: empty object.
+_END_TEMPLATE = (
+    "{{ (dict(event_type=value_json.state, id=value_json.id, key=value_json.goal.key, "
+    f"text=(value_json.goal.text or '')[:{_MAX_EVENT_TEXT_CHARS}], reason=value_json.goal.reason, "
+    f"message=value_json.goal.message, by=value_json.goal.by) if value_json.state in {_END_STATES} else {{}}) "
+    "| tojson }}"
+)
+#: Seconds within which a message to the notifier must be spoken. Home Assistant sends messages that don't expire.
+_SAY_TTL_S = 30
+# Home Assistant inserts the message of the action `notify.send_message` as `value`.
+_SAY_TEMPLATE = f"{{{{ dict(request='say', text=value, ttl={_SAY_TTL_S}) | tojson }}}}"
+_INTERRUPT_TEMPLATE = "{{ dict(request='say', text=value, preempt=True, priority=10, ttl=10) | tojson }}"
+#: The requests that each component sends. The other components send none.
+_NEEDED_REQUESTS = {
+    "say": ("say",),
+    "interrupt": ("say",),
+    "cancel": ("cancel",),
+    "paused": ("pause", "resume"),
+}
 
 
 def homeassistant_device(name: str, allow: Collection[str], version: str) -> Message:
@@ -185,28 +210,93 @@ def homeassistant_device(name: str, allow: Collection[str], version: str) -> Mes
             removes them.
         version: the bridge's version.
     """
-    identifier = f"{topics.PREFIX}-{name}"
-    components = {
-        "say": _command(name, topics.PLAIN_SAY, "notify", None, allowed="say" in allow),
-        "cancel": _command(name, topics.PLAIN_CANCEL, "button", "Cancel", allowed="cancel" in allow),
-        "state": _sensor(name, "State", _STATE_TEMPLATE, device_class="enum", options=["idle", "speaking", "paused"]),
-        "speaking": _sensor(name, "Speaking", _SPEAKING_TEMPLATE, platform="binary_sensor"),
-        "pending": _sensor(name, "Pending", "{{ value_json.pending }}", state_class="measurement"),
-        "last": _sensor(
-            name,
-            "Last result",
-            _LAST_TEMPLATE,
-            device_class="enum",
-            options=[each.name for each in EXIT_CODES],
-            json_attributes_topic=topics.robot(name, topics.STATUS),
-            json_attributes_template="{{ (value_json.last or {}) | tojson }}",
-        ),
+    identifier, status, allowed = f"{topics.PREFIX}-{name}", topics.robot(name, topics.STATUS), frozenset(allow)
+    components: dict[str, JsonObject] = {
+        "say": {"platform": "notify", "name": None, "icon": "mdi:bullhorn", "command_template": _SAY_TEMPLATE},
+        "interrupt": {
+            "platform": "notify",
+            "name": "Interrupt",
+            "icon": "mdi:bullhorn-variant",
+            "command_template": _INTERRUPT_TEMPLATE,
+        },
+        "cancel": {
+            "platform": "button",
+            "name": "Cancel",
+            "icon": "mdi:stop",
+            "payload_press": _request_payload("cancel"),
+        },
+        "paused": {
+            "platform": "switch",
+            "name": "Paused",
+            "icon": "mdi:pause",
+            "state_topic": status,
+            "value_template": _PAUSED_TEMPLATE,
+            "state_on": "ON",
+            "state_off": "OFF",
+            "payload_on": _request_payload("pause"),
+            "payload_off": _request_payload("resume"),
+        },
+        "state": {
+            "platform": "sensor",
+            "name": "State",
+            "icon": "mdi:account-voice",
+            "state_topic": status,
+            "value_template": _STATE_TEMPLATE,
+            "device_class": "enum",
+            "options": ["idle", "speaking", "paused"],
+        },
+        "speaking": {
+            "platform": "binary_sensor",
+            "name": "Speaking",
+            "icon": "mdi:volume-high",
+            "state_topic": status,
+            "value_template": _SPEAKING_TEMPLATE,
+        },
+        "pending": {
+            "platform": "sensor",
+            "name": "Pending",
+            "icon": "mdi:tray-full",
+            "state_topic": status,
+            "value_template": "{{ value_json.pending }}",
+            "state_class": "measurement",
+            "entity_category": "diagnostic",
+        },
+        "last": {
+            "platform": "sensor",
+            "name": "Last result",
+            "icon": "mdi:message-check",
+            "state_topic": status,
+            "value_template": _LAST_TEMPLATE,
+            "device_class": "enum",
+            "options": _END_STATES,
+            "entity_category": "diagnostic",
+            "json_attributes_topic": status,
+            "json_attributes_template": "{{ (value_json.last or {}) | tojson }}",
+        },
+        "ended": {
+            "platform": "event",
+            "name": "Sentence ended",
+            "icon": "mdi:message-text-clock",
+            "state_topic": topics.robot(name, topics.EVENT, "state"),
+            "value_template": _END_TEMPLATE,
+            "event_types": _END_STATES,
+        },
     }
     for key, component in components.items():
-        if len(component) > 1:
-            component["unique_id"] = f"{identifier}-{key}"
+        needed = _NEEDED_REQUESTS.get(key, ())
+        if needed:
+            component["command_topic"] = topics.robot(name, topics.REQUEST, topics.HOMEASSISTANT)
+        component |= {"qos": 1, "unique_id": f"{identifier}-{key}"}
+        if not allowed.issuperset(needed):
+            components[key] = {"platform": component["platform"]}
     payload: JsonObject = {
-        "device": {"identifiers": [identifier], "name": name, "model": "talk", "sw_version": version},
+        "device": {
+            "identifiers": [identifier],
+            "name": name,
+            "manufacturer": "talk",
+            "model": "Speaking robot",
+            "sw_version": version,
+        },
         "origin": {"name": "talk", "sw_version": version},
         "availability": [{"topic": topics.robot(name, topics.PRESENCE), "value_template": _AVAILABLE}],
         "components": components,
@@ -214,18 +304,6 @@ def homeassistant_device(name: str, allow: Collection[str], version: str) -> Mes
     return Message(topics.homeassistant_device(name), encode(payload), retained=True)
 
 
-def _command(robot: str, topic_level: str, platform: str, label: str | None, *, allowed: bool) -> JsonObject:
-    """Return a Home Assistant component that sends a request to the robot.
-
-    If the request isn't allowed, the component is empty.
-    """
-    if not allowed:
-        return {"platform": platform}
-    topic = topics.robot(robot, topic_level, topics.HOMEASSISTANT)
-    return {"platform": platform, "command_topic": topic, "qos": 1, "name": label}
-
-
-def _sensor(robot: str, label: str, template: str, platform: str = "sensor", **more: object) -> JsonObject:
-    """Return a Home Assistant component that shows part of the robot's status."""
-    topic = topics.robot(robot, topics.STATUS)
-    return {"platform": platform, "name": label, "state_topic": topic, "value_template": template, "qos": 1, **more}
+def _request_payload(kind: str) -> str:
+    """Return the payload of a request that has no fields."""
+    return encode({"request": kind}).decode().removesuffix("\n")

@@ -98,7 +98,11 @@ def checked_reply_topic(response_topic: str, user: str, robot_name: str) -> str 
 
 
 def access_rules(
-    operators: tuple[str, ...] = ("OPERATOR",), *, homeassistant: bool = False, name: str | None = None
+    operators: tuple[str, ...] = ("OPERATOR",),
+    *,
+    homeassistant: bool = False,
+    addon: bool = False,
+    name: str | None = None,
 ) -> str:
     """Return the content of mosquitto's `acl_file` for a fleet.
 
@@ -110,6 +114,8 @@ def access_rules(
     Args:
         operators: the users who may command every robot.
         homeassistant: whether to add the rules for Home Assistant.
+        addon: whether the broker is Home Assistant's Mosquitto add-on. The add-on and Home Assistant need unrestricted
+            access to it, as its documentation says.
         name: a robot that is shown in Home Assistant. A name with a dot gets its own rule, because the pattern for the
             other robots doesn't match its topic.
     """
@@ -123,7 +129,7 @@ def access_rules(
         f"pattern write {robot('%u', EVENT, '+')}",
         f"pattern write {reply('+', '+', '%u')}",
     ]
-    if homeassistant:
+    if homeassistant or addon:
         lines += [f"pattern write {homeassistant_device('%u')}", f"pattern read {HOMEASSISTANT_STATUS}"]
     for each in operators:
         lines += [
@@ -137,18 +143,24 @@ def access_rules(
             f"topic read {robot('+', EVENT, '+')}",
             f"topic readwrite {reply(each, '+', '+')}",
         ]
-    if homeassistant:
+    if addon:
+        lines += [
+            "",
+            "# Home Assistant's own logins need unrestricted access. Every other login needs its own rules, too.",
+            *(line for user in (HOMEASSISTANT, "addons") for line in (f"user {user}", "topic readwrite #")),
+        ]
+    elif homeassistant:
         lines += [
             "",
             "# Home Assistant may make each robot speak, cancel sentences, and use all topics under homeassistant/.",
             f"user {HOMEASSISTANT}",
-            f"topic write {robot('+', PLAIN_SAY, HOMEASSISTANT)}",
-            f"topic write {robot('+', PLAIN_CANCEL, HOMEASSISTANT)}",
+            *(f"topic write {robot('+', level, HOMEASSISTANT)}" for level in REQUEST_LEVELS),
             f"topic read {robot('+', PRESENCE)}",
             f"topic read {robot('+', STATUS)}",
+            f"topic read {robot('+', EVENT, '+')}",
             f"topic readwrite {HOMEASSISTANT}/#",
         ]
-    if homeassistant and name is not None and "." in name:
+    if (homeassistant or addon) and name is not None and "." in name:
         words = "# Home Assistant does not allow dots in names, so this robot uses a different topic."
         lines += ["", words, f"user {name}", f"topic write {homeassistant_device(name)}"]
     return "\n".join(lines)

@@ -20,7 +20,16 @@ if TYPE_CHECKING:
 TOPIC = re.compile(r"homeassistant/device/(?:[a-zA-Z0-9_-]+/)?[a-zA-Z0-9_-]+/config")
 #: The topic and the message that Home Assistant publishes when it has started.
 BIRTH = ("homeassistant/status", "online")
-_ANY = {"platform", "unique_id", "name", "qos", "icon", "json_attributes_topic", "json_attributes_template"}
+_ANY = {
+    "platform",
+    "unique_id",
+    "name",
+    "qos",
+    "icon",
+    "json_attributes_topic",
+    "json_attributes_template",
+    "entity_category",
+}
 _COMMAND = {*_ANY, "command_topic", "retain"}
 _STATE = {*_ANY, "state_topic", "value_template", "device_class"}
 #: The required and the allowed keys of each part of the payload.
@@ -29,22 +38,29 @@ KEYS = {
     "device": ({"identifiers", "name"}, {"identifiers", "name", "manufacturer", "model", "sw_version"}),
     "origin": ({"name"}, {"name", "sw_version", "support_url"}),
     "availability": ({"topic"}, {"topic", "value_template"}),
-    "notify": ({"unique_id", "command_topic"}, _COMMAND),
+    "notify": ({"unique_id", "command_topic"}, {*_COMMAND, "command_template"}),
+    "switch": (
+        {"unique_id", "command_topic"},
+        {*_COMMAND, *_STATE, "payload_on", "payload_off", "state_on", "state_off"},
+    ),
+    "event": ({"unique_id", "state_topic", "event_types"}, {*_STATE, "event_types"}),
     "button": ({"unique_id", "command_topic"}, {*_COMMAND, "payload_press"}),
     "sensor": ({"unique_id", "state_topic"}, {*_STATE, "options", "state_class"}),
     "binary_sensor": ({"unique_id", "state_topic"}, {*_STATE, "payload_on", "payload_off"}),
 }
 #: A template that means the same in Jinja and Python. In Jinja, names such as `items` are methods.
 _WORD = (
-    r"value_json(?:\.(?!items\b|keys\b|values\b|get\b|pop\b|copy\b)\w+)*|'\w+'|if|else|and|or|not|None|\{\}|\| tojson"
+    r"value_json(?:\.(?!items\b|keys\b|values\b|get\b|pop\b|copy\b)\w+)*|'\w*'|if|else|and|or|not|in|None|True"
+    r"|\{\}|\| tojson|dict|\w+=|\d+|value|[][(),:]"
 )
-_TEMPLATE = rf'"\{{\{{ (?:\(?(?:{_WORD})\)? )+\}}\}}"'
+_TEMPLATE = rf'"\{{\{{ (?:(?:{_WORD}) ?)+\}}\}}"'
 _TEXT, _TEXTS = '".+"', r'\[".+"\]'
 #: The JSON form of a value. Values that are not listed are texts.
 VALUES = {
+    "icon": '"mdi:[a-z-]+"', "entity_category": '"diagnostic"', "event_types": _TEXTS,
     "qos": "[012]", "retain": "true|false", "name": f"{_TEXT}|null", "identifiers": _TEXTS, "options": _TEXTS,
     "device_class": '"(enum|running|sound)"', "state_class": '"measurement"', "command_topic": '"[^+#]+"',
-    "value_template": _TEMPLATE, "json_attributes_template": _TEMPLATE,
+    "value_template": _TEMPLATE, "command_template": _TEMPLATE, "json_attributes_template": _TEMPLATE,
     **dict.fromkeys(("device", "origin", "components", "availability"), ".+"),
 }  # fmt: skip
 
@@ -70,12 +86,12 @@ def faults(topic: str, payload: bytes) -> list[str]:
     return errors
 
 
-def rendered(template: str, payload: bytes) -> str:
-    """Return the result of a template for a message."""
+def rendered(template: str, payload: bytes, value: str = "") -> str:
+    """Return the result of a template for a message, or for the value of a command."""
     expression, filtered, _ = template.removeprefix("{{ ").removesuffix(" }}").partition(" | tojson")
     message = json.loads(payload, object_hook=lambda fields: SimpleNamespace(**fields))
-    value = eval(expression, {"value_json": message})
-    return json.dumps(value, default=vars) if filtered else str(value)
+    result = eval(expression, {"value_json": message, "value": value})
+    return json.dumps(result, default=vars) if filtered else str(result)
 
 
 class HomeAssistant(Listener):
@@ -91,8 +107,8 @@ class HomeAssistant(Listener):
         """Wait for a device, subscribe to its states, and return its announcement."""
         message = self.await_message(lambda message: bool(TOPIC.fullmatch(message.topic) and message.payload))
         assert faults(message.topic, message.payload) == []
-        topics = {availability["topic"] for availability in message.json["availability"]}
-        for topic in topics | {message.json["components"]["state"]["state_topic"]}:
+        parts = [*message.json["availability"], *message.json["components"].values()]
+        for topic in {part[key] for part in parts for key in ("topic", "state_topic") if key in part}:
             assert self.subscribe(topic) <= 1
         return message.json
 
@@ -100,10 +116,18 @@ class HomeAssistant(Listener):
         """Wait until the entities are in these states."""
         self.await_message(lambda _: all(self._state(device, key) == state for key, state in expected.items()))
 
-    def command(self, device: dict[str, Any], key: str, text: str = "PRESS") -> int:
-        """Press a button or send a message to the notifier, and return the broker's reason code."""
+    def command(self, device: dict[str, Any], key: str, text: str = "", payload: str = "payload_press") -> int:
+        """Press a button or a switch, or send a message to a notifier, and return the broker's reason code."""
         entity = device["components"][key]
-        return self.publish(entity["command_topic"], text, entity["qos"], entity.get("retain", False))
+        template = entity.get("command_template")
+        message = rendered(template, b"{}", text) if template else entity[payload]
+        return self.publish(entity["command_topic"], message, entity["qos"], entity.get("retain", False))
+
+    def end_events(self, device: dict[str, Any]) -> list[dict[str, Any]]:
+        """Return the events of the event entity so far, oldest first."""
+        entity = device["components"]["ended"]
+        payloads = [message.payload for message in self.messages if message.topic == entity["state_topic"]]
+        return [event for each in payloads if (event := json.loads(rendered(entity["value_template"], each)))]
 
     def _state(self, device: dict[str, Any], key: str) -> str | None:
         payloads = {message.topic: message.payload for message in self.messages}

@@ -67,6 +67,7 @@ def test_the_access_rules_are_printed(home: str) -> None:
     assert run_bridge(home, "--print-acl") == (0, topics.access_rules() + "\n", "")
     rules = topics.access_rules(homeassistant=True, name="r2.d2") + "\n"
     assert run_bridge(home, "--name", "r2.d2", "--homeassistant", "--print-acl") == (0, rules, "")
+    assert run_bridge(home, "--print-addon-acl") == (0, topics.access_rules(addon=True) + "\n", "")
 
 
 def printed_unit(home: str, name: str, *options: str) -> str:

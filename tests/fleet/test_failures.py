@@ -297,6 +297,9 @@ def test_with_no_text_only_the_remote_client_reads_a_sentence(broker: Broker, ma
         assert carl.ask("log", history=True)["count"] == carl.ask("log")["count"] == 3
         assert carl.ask("status", id=goal["id"])["goal"]["key"] is None
         assert carl.ask("log", grep="secret")["error"]["code"] == "not_allowed"
+        assert olga.ask("pause")["ok"]
+        assert [olga.say("secret")["state"] for _ in range(16)] == ["PENDING"] * 15 + ["REJECTED"]  # by the bridge
+        listener.await_message(lambda event: event.topic.endswith("/state") and event.json["state"] == "REJECTED")
         messages = [*listener.messages, *carl.listener.messages]
     assert {message.topic.rpartition("/")[2] for message in messages} >= {"state", "status", "presence"}
     assert [message for message in messages if "secret" in message.text] == []

@@ -50,6 +50,37 @@ def test_an_interrupted_sentence_that_continues_counts_as_speaking(announced: Ro
         home.await_states(device, state="idle", last="PREEMPTED", speaking="OFF")
 
 
+def test_a_flood_of_announcements_reports_each_lost_one(announced: Robot) -> None:
+    with HomeAssistant(announced.broker) as home:
+        device = home.device()
+        home.command(device, "paused", payload="payload_on")
+        home.await_states(device, paused="ON")
+        for number in range(18):
+            home.command(device, "say", f"number {number}")
+        home.await_states(device, pending="15", last="REJECTED")
+        home.command(device, "cancel")
+        home.await_message(lambda _: len(home.end_events(device)) == 18)
+        ended = {event["text"]: (event["event_type"], event["reason"]) for event in home.end_events(device)}
+        home.command(device, "paused", payload="payload_off")
+        home.await_states(device, paused="OFF")
+    assert ended == {
+        f"number {number}": ("RECALLED", "canceled") if number < 15 else ("REJECTED", "queue_full")
+        for number in range(18)
+    }
+    announced.bridge.await_log("rejected a goal of homeassistant: 15 goals of remote clients are already waiting")
+
+
+def test_an_interrupting_message_replaces_the_current_one(announced: Robot) -> None:
+    with HomeAssistant(announced.broker) as home:
+        device = home.device()
+        home.command(device, "say", LONG)
+        home.await_states(device, state="speaking")
+        home.command(device, "interrupt", "fire")
+        home.await_states(device, last="SUCCEEDED")
+        ended = [(event["text"], event["event_type"]) for event in home.end_events(device)]
+    assert ended == [(LONG, "PREEMPTED"), ("fire", "SUCCEEDED")]
+
+
 def test_the_announcement_is_repeated_when_home_assistant_starts(announced: Robot) -> None:
     with HomeAssistant(announced.broker) as home:
         kept = home.await_message(lambda message: message.topic == ANNA)
@@ -119,6 +150,7 @@ def test_the_printed_access_rules_suffice_for_home_assistant(make_talk: MakeTalk
             device = home.device()
             home.command(device, "say", "hello")
             home.await_states(device, last="SUCCEEDED")
+            home.await_message(lambda _: bool(home.end_events(device)))
             home.await_message(lambda message: message.topic == DOTTED and message is not announced)
 
 

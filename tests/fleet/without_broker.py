@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from talkcli.fleet.bridge.session import RemoteSessions
+    from talkcli.goals.goal import Goal
 
 
 class SessionsWithoutBroker:
@@ -29,11 +30,19 @@ class SessionsWithoutBroker:
 
         #: the topic and the lines of each published message
         self.published: list[tuple[str, list[dict[str, Any]]]] = []
+        #: goals that ended without being sent to the server
+        self.ended: list[Goal] = []
         self._more = asyncio.Event()
         self._boottime = boottime
         self._policy = policy.Policy("anna", policy.ALLOWABLE_REQUESTS)
         self.sessions: RemoteSessions = RemoteSessions(
-            "anna", socket, self._publish, lambda: room, lambda: None, lambda: "token"
+            "anna",
+            socket,
+            self._publish,
+            lambda: room,
+            lambda: None,
+            lambda: "token",
+            self.ended.append,
         )
 
     def post(self, fields: object, session: str = "s1", *, correlation: bytes | None = None) -> None:

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from talkcli.fleet import topics
+from talkcli.goals.options import Say
+from talkcli.protocol.requests import read_request
 from tests.fleet.many import RealRobots
 from tests.readme.blocks import block, commands, runs
 from tests.readme.shell import Shell, wait_until
@@ -247,6 +249,15 @@ def test_plain_texts_requests_and_sessions_work(site: Site) -> None:
         before = wire.request("status")["server"]["clients"]
         assert site.run("Requests and replies: A session") == ""
         wait_until(lambda: wire.request("status")["server"]["clients"] == before - 1)
+
+
+@runs("Home Assistant: Scripts", "Home Assistant: Scripts #2")
+def test_the_script_for_home_assistant_sends_a_valid_request() -> None:
+    """`python -m tests.tools.homeassistant` runs the scripts themselves."""
+    payload = re.search(r"\{\{ (dict\(request=.*\)) \| to_json \}\}", block("Home Assistant: Scripts"), re.DOTALL)
+    assert payload
+    request = read_request(eval(payload[1].replace(" | string", ""), {"text": "hello", "goal": "ha-1"}))
+    assert request == Say("hello", id="ha-1", key="ha-1", ttl=30)
 
 
 def _part(whole: Any, like: Any) -> Any:

@@ -11,7 +11,12 @@ import pytest
 from talkcli.fleet import topics
 from talkcli.fleet.bridge.policy import ALLOWABLE_REQUESTS
 from talkcli.fleet.payloads import homeassistant_device
+from talkcli.goals.goal import By, Goal, Sender
+from talkcli.goals.options import Cancel, Pause, Say
 from talkcli.goals.states import State
+from talkcli.protocol.events import StateChanged
+from talkcli.protocol.lines import decode, encode
+from talkcli.protocol.requests import Resume, read_request
 from tests.fleet.homeassistant import TOPIC, faults, rendered
 
 STATUS: dict[str, Any] = {"active": None, "text": None, "pending": 0, "paused": False, "last": None}
@@ -31,21 +36,56 @@ def announcement(name: str = "anna", allow: tuple[str, ...] = ALLOWABLE_REQUESTS
 def test_an_announcement_follows_home_assistants_rules(name: str) -> None:
     payload = announcement(name)
     assert payload["device"] == {
-        "identifiers": [f"talk-{name}"], "name": name, "model": "talk", "sw_version": "0.1.0",
+        "identifiers": [f"talk-{name}"], "name": name, "manufacturer": "talk", "model": "Speaking robot",
+        "sw_version": "0.1.0",
     }  # fmt: skip
-    for key in ("say", "cancel"):
-        topic = payload["components"][key]["command_topic"]
-        assert topics.parse_request_topic(topic) == (key, "homeassistant")
-        assert topic.startswith(f"talk/robot/{name}/")
+    for key in ("say", "interrupt", "cancel", "paused"):
+        assert payload["components"][key]["command_topic"] == f"talk/robot/{name}/request/homeassistant"
         assert not payload["components"][key].get("retain")  # retained requests are never spoken
-    assert {*payload["components"]["last"]["options"]} == {state.name for state in State if state.terminal}
+    ends = {state.name for state in State if state.terminal}
+    assert {*payload["components"]["last"]["options"]} == {*payload["components"]["ended"]["event_types"]} == ends
+    assert all("icon" in component for component in payload["components"].values())
 
 
-@pytest.mark.parametrize("allow", [("say", "status"), ("cancel",), ()])
+@pytest.mark.parametrize("allow", [("say", "status"), ("cancel", "pause"), ("pause", "resume"), ()])
 def test_an_entity_for_a_forbidden_request_is_removed(allow: tuple[str, ...]) -> None:
     components = announcement(allow=allow)["components"]
-    for key, platform in (("say", "notify"), ("cancel", "button")):
-        assert (components[key] == {"platform": platform}) == (key not in allow)
+    for key, platform, needed in (
+        ("say", "notify", {"say"}),
+        ("interrupt", "notify", {"say"}),
+        ("cancel", "button", {"cancel"}),
+        ("paused", "switch", {"pause", "resume"}),
+    ):
+        assert (components[key] == {"platform": platform}) == (not needed <= {*allow})
+
+
+@pytest.mark.parametrize(
+    ("key", "field", "request_"),
+    [
+        ("say", "command_template", Say("it's <open>", ttl=30)),
+        ("interrupt", "command_template", Say("it's <open>", preempt=True, priority=10, ttl=10)),
+        ("cancel", "payload_press", Cancel()),
+        ("paused", "payload_on", Pause()),
+        ("paused", "payload_off", Resume()),
+    ],
+)
+def test_each_command_is_a_valid_request(key: str, field: str, request_: object) -> None:
+    payload = announcement()["components"][key][field]
+    line = rendered(payload, b"{}", "it's <open>") if field == "command_template" else payload
+    assert read_request(decode(line.encode())) == request_
+
+
+@pytest.mark.parametrize("text", ["it's <open>", "x" * 1001, None])
+def test_only_the_end_of_a_goal_is_an_event(text: str | None) -> None:
+    template = announcement()["components"]["ended"]["value_template"]
+    ended = Goal("door-17", State.RECALLED, text, "canceled", By(client=Sender(name="olga")), "not spoken", key="door")
+    event = json.loads(rendered(template, encode(StateChanged("door-17", ended.state, 1.5, 7, ended).to_json())))
+    assert (event.pop("by")["client"]["name"], event) == ("olga", {
+        "event_type": "RECALLED", "id": "door-17", "key": "door", "text": (text or "")[:1000], "reason": "canceled",
+        "message": "not spoken",
+    })  # fmt: skip
+    for other in (StateChanged("door-17", State.ACTIVE), StateChanged("door-17", State.PENDING, goal=ended)):
+        assert rendered(template, encode(other.to_json())) == "{}"
 
 
 @pytest.mark.parametrize(
@@ -65,17 +105,17 @@ def test_a_device_is_available_if_its_robot_can_speak(presence: dict[str, Any], 
 @pytest.mark.parametrize(
     ("status", "states"),
     [
-        ({}, ["idle", "OFF", "0", "None"]),
-        ({"active": "door-17", "pending": 7}, ["speaking", "ON", "7", "None"]),
-        ({"active": "door-17", "paused": True}, ["paused", "OFF", "0", "None"]),
-        ({"paused": True}, ["paused", "OFF", "0", "None"]),
-        ({"last": ENDED}, ["idle", "OFF", "0", "ABORTED"]),
-        ({"last": ENDED_WITHOUT_TEXT}, ["idle", "OFF", "0", "ABORTED"]),
+        ({}, ["idle", "OFF", "0", "None", "OFF"]),
+        ({"active": "door-17", "pending": 7}, ["speaking", "ON", "7", "None", "OFF"]),
+        ({"active": "door-17", "paused": True}, ["paused", "OFF", "0", "None", "ON"]),
+        ({"paused": True}, ["paused", "OFF", "0", "None", "ON"]),
+        ({"last": ENDED}, ["idle", "OFF", "0", "ABORTED", "OFF"]),
+        ({"last": ENDED_WITHOUT_TEXT}, ["idle", "OFF", "0", "ABORTED", "OFF"]),
     ],
 )
 def test_the_entities_show_the_status(status: dict[str, Any], states: list[str]) -> None:
     payload, components = json.dumps(STATUS | status).encode(), announcement()["components"]
-    entities = [components[key] for key in ("state", "speaking", "pending", "last")]
+    entities = [components[key] for key in ("state", "speaking", "pending", "last", "paused")]
     assert [rendered(entity["value_template"], payload) for entity in entities] == states
     assert {entity["state_topic"] for entity in entities} == {"talk/robot/anna/status"}
     assert components["last"]["json_attributes_topic"] == "talk/robot/anna/status"

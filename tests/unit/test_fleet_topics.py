@@ -78,8 +78,8 @@ OPERATOR = {
     "write": "robot/+/request/olga robot/+/say/olga robot/+/cancel/olga group/+/request/olga reply/olga/+/+",
 }
 HOME = {
-    "read": "robot/+/presence robot/+/status",
-    "write": "robot/+/say/homeassistant robot/+/cancel/homeassistant",
+    "read": "robot/+/presence robot/+/status robot/+/event/+",
+    "write": "robot/+/request/homeassistant robot/+/say/homeassistant robot/+/cancel/homeassistant",
 }
 
 
@@ -113,6 +113,15 @@ def test_each_login_may_use_only_its_own_topics(way: str) -> None:
     assert may(way, "homeassistant", rules) == full_topics(HOME[way]) | {"homeassistant/#"}
     dotted = {"homeassistant/device/talk-dots/r2_dd2/config"} if way == "write" else set()
     assert may(way, "r2.d2", rules) == dotted
+
+
+def test_home_assistants_logins_are_unrestricted_on_its_add_on() -> None:
+    rules = topics.access_rules(("olga",), addon=True, name="r2.d2")
+    for login in ("homeassistant", "addons"):
+        assert may("read", login, rules) == may("write", login, rules) == {"#"}
+    for robot_or_operator in (None, "olga", "r2.d2"):
+        plain = topics.access_rules(("olga",), homeassistant=True, name="r2.d2")
+        assert may("write", robot_or_operator, rules) == may("write", robot_or_operator, plain)
 
 
 def test_all_operators_have_the_same_rules() -> None:

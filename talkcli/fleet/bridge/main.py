@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
     from talkcli.fleet.broker import Broker
     from talkcli.fleet.link import OnAcknowledged
+    from talkcli.goals.goal import Goal
 
 #: How long the broker keeps a robot's presence, and how often the bridge renews it.
 PRESENCE_EXPIRY_S, PRESENCE_EVERY_S = 150, 60.0
@@ -139,6 +140,7 @@ class Bridge:
             self._max_payload,
             self._systemd.schedule_status,
             lambda: self._policy.new_token(boottime()),
+            self._on_goal_end,
             with_text=settings.with_text,
         )
         self._publisher = Publisher(self._sessions, self._publish_to_all, self._on_server_change)
@@ -477,6 +479,10 @@ class Bridge:
         """Publish the robot's description for Home Assistant as a retained message, if enabled."""
         if self._settings.homeassistant and self._online:
             self._publish(homeassistant_device(self._settings.name, self._settings.allow, __version__))
+
+    def _on_goal_end(self, goal: Goal) -> None:
+        """Publish the end of a goal that was never sent to the server."""
+        self._publisher.publish_end(goal)
 
     def _on_server_change(self) -> None:
         """Report to systemd and to the fleet that the robot's server has started or ended."""

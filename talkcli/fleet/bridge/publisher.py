@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
     from talkcli.fleet.bridge.session import RemoteSessions
     from talkcli.goals.goal import Goal, JsonObject
+    from talkcli.protocol.events import Event
 
     PublishToAll = Callable[[Message], None]
 
@@ -184,9 +185,6 @@ class Publisher:
         if isinstance(event, StateChanged):
             self._update_goals(event)
             self._sessions.handle_goal_change(event, server.boot)
-            if event.goal and (not self._sessions.with_text or len(line) >= self._sessions.max_payload()):
-                goal = replace(event.goal, **dict.fromkeys(PRIVATE_FIELDS))
-                line = encode(replace(event, goal=goal).to_json()).removesuffix(b"\n")
         elif isinstance(event, PausedChanged):
             self._paused = event.paused
         elif isinstance(event, GoalInterrupted):
@@ -196,8 +194,22 @@ class Publisher:
             if isinstance(event, TextAdded):
                 self._add_text(event)
             return
-        topic = topics.robot(self._sessions.name, topics.EVENT, str(message["event"]))
-        self._publish(Message(topic, line + b"\n", expiry=EVENT_EXPIRY_S))
+        self._publish_event(str(message["event"]), event, line + b"\n")
+
+    def publish_end(self, goal: Goal) -> None:
+        """Publish the end of a goal that the bridge has ended itself, without sending it to the server."""
+        self._last = goal
+        event = StateChanged(goal.id, goal.state, goal.ended_at, goal=goal)
+        self._publish_event("state", event, encode(event.to_json()))
+
+    def _publish_event(self, kind: str, event: Event, line: bytes) -> None:
+        """Publish an event's line, without the goal's texts if they are private or too long. Schedule a status."""
+        shown = self._sessions.with_text and len(line) <= self._sessions.max_payload()
+        if isinstance(event, StateChanged) and event.goal and not shown:
+            goal = replace(event.goal, **dict.fromkeys(PRIVATE_FIELDS))
+            line = encode(replace(event, goal=goal).to_json())
+        topic = topics.robot(self._sessions.name, topics.EVENT, kind)
+        self._publish(Message(topic, line, expiry=EVENT_EXPIRY_S))
         self.schedule_status()
 
     def _update_goals(self, event: StateChanged) -> None:

@@ -68,6 +68,7 @@ class RemoteSessions:
         max_payload: Callable[[], int],
         on_change: Callable[[], None],
         new_token: Callable[[], str],
+        on_end: Callable[[Goal], None],
         *,
         with_text: bool = True,
     ) -> None:
@@ -80,11 +81,12 @@ class RemoteSessions:
             max_payload: returns the size of the largest payload that the broker accepts, in bytes.
             on_change: called when the number of pending goals may have changed.
             new_token: returns a new token, which shows a client's requests to be recent.
+            on_end: called after a goal has ended without being sent to the server.
             with_text: whether the status, the events and the answers to `watch`, to `log` and to a `status` with an id
                 contain the texts of goals.
         """
         self.name, self.socket, self.with_text = name, socket, with_text
-        self.publish, self.max_payload, self.new_token = publish, max_payload, new_token
+        self.publish, self.max_payload, self.new_token, self.on_end = publish, max_payload, new_token, on_end
         self.ids = policy.SentIds()
         self.goals = policy.RemoteGoals(self.ids)
         #: limits the number of connections that are waiting for the server's greeting
@@ -431,6 +433,7 @@ class RemoteSession:
         else:
             count, total = shared.goals.count(self.user), len(shared.goals)
             words = f"{total} goals of remote clients are already waiting, {count} of them from {self.user}"
+            log.write_limited("full", f"rejected a goal of {self.user}: {words}")
             # Like the server, don't give a rejected goal the id that its client has chosen.
             self.end_goal(remote_request, replace(say, id=None), State.REJECTED, "queue_full", f"not spoken: {words}")
 
@@ -556,7 +559,9 @@ class RemoteSession:
     # -- to the client
 
     def refuse(self, request: RemoteRequest, code: str, message: str) -> None:
-        """Answer a client's request with an error."""
+        """Answer a client's request with an error. Log the error if the client wants no answers."""
+        if self._reply_topic is None:
+            log.write_limited(code, f"refused a request of {self.user}: {log.sanitize(message)}")
         self._publish([_ReplyLine(encode(failure(request.seq, code, message)), request.correlation)])
 
     def end_goal(
@@ -582,6 +587,7 @@ class RemoteSession:
             events = StateChanged(goal_id, state, now).to_json(), Result(goal).to_json()
             lines += [_ReplyLine(encode(each)) for each in events]
         self._publish(lines)
+        self._sessions.on_end(goal)
         return goal
 
     def _send_gone(self, why: str) -> None:
