@@ -130,7 +130,10 @@ class LoopConnection(Connection):
         return super().begin(request, on_reply, on_failure)
 
     def wait_until(self, done: Callable[[], bool], deadline: float | None, **options: Any) -> bool:
-        """Process the messages that have arrived. The deadline must not be in the future."""
+        """Process the messages that have arrived. Return whether `done()` is true.
+
+        The deadline must not be in the future.
+        """
         self._run_soon()
         return super().wait_until(done, deadline, **options)
 

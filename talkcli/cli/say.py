@@ -174,7 +174,7 @@ def _run_without_goal(
         code = _write_wav_file(None if dry_run else path, text, values, timeout, options)
         if code or not dry_run:
             return code
-        goal = Goal("", State.PENDING, text, format=values["format"], said=table.say(text, values["format"]))
+        goal = Goal("", State.PENDING, text, format=values["format"], said=table.spoken_form(text, values["format"]))
     said = str(goal.text if goal.said is None else goal.said)
     show_result(options, [goal.to_json()], lambda: map(printable, said.splitlines()))
     return EXIT_OK

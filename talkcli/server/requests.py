@@ -455,17 +455,17 @@ class Requests:
         records = [each for each in records if matches(filters, _filter_values(each))][-request.count :]
         pending.answer(_goal_items("goal", records), count=len(records))
 
-    def _history_items(self, pending: PendingRequest, rows: list[Row], size: int) -> Iterator[JsonObject]:
+    def _history_items(self, pending: PendingRequest, rows: list[Row], held_bytes: int) -> Iterator[JsonObject]:
         """Yield an object for each row of the history. Goals that are still in memory have their texts.
 
-        `size` is counted as held output until all objects are sent.
+        `held_bytes` are counted as held output until all objects are sent.
         """
         for row in rows:
             goal = row_to_json(row)
             record = self._scheduler.find(str(goal["id"]))
             is_same = record is not None and record.ended_at == goal["ended_at"]
             yield {"goal": record.snapshot().to_json() if record and is_same else goal}
-        pending.connection.stream.adjust_held_bytes(-size)
+        pending.connection.stream.adjust_held_bytes(-held_bytes)
 
     async def _set(self, pending: PendingRequest, request: Set) -> None:
         """Check and change the server's settings, and reply with all settings."""

@@ -287,7 +287,7 @@ class Speech:
             terms = self._current_pronunciations()
         if terms is None or goal.text is None or record.say.is_sound:
             return goal
-        return replace(goal, said=Pronunciations(terms).say(goal.text, goal.format))
+        return replace(goal, said=Pronunciations(terms).spoken_form(goal.text, goal.format))
 
     def _announce_next(self) -> None:
         """Tell the engine whether another goal follows the active one."""

@@ -788,7 +788,7 @@ class Playback:
             self._end_early(self._runner.word_end_due - time.monotonic())
 
     def _end_early(self, time_left: float) -> None:
-        """Cut off the samples where the next word begins, and raise EndedEarly.
+        """If the current word can end now, cut off the samples after it, and raise EndedEarly.
 
         Do nothing if the next word isn't known yet, or if it begins too late. `time_left` is the time in seconds in
         which the current word must end. After that, the word is cut off.

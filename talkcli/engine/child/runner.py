@@ -300,7 +300,7 @@ class GoalRunner:
                     self._interrupt_driver(goal)
 
     def _interrupt_driver(self, goal: ActiveGoal) -> None:
-        """Stop a third-party driver, because it can't be paused.
+        """Stop the driver if it is a third-party driver, which can't be paused.
 
         In `talk`'s own driver, the playback handles pauses and interruptions.
         """
@@ -331,10 +331,7 @@ class GoalRunner:
             self._channel.send(protocol.VoiceChosen(goal.id, voice, fallback_reason or goal.fallback_reason))
 
     def find_word(self, location: int, length: int) -> tuple[int, int, int] | None:
-        """Find the word at a location in the current goal's text.
-
-        Return the word's start, end and number, or None if it is not a new word.
-        """
+        """Return the start, end and number of the word at a location, or None if the word isn't new."""
         assert self._goal
         return self._goal.words.find(location, length)
 

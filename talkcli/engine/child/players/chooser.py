@@ -146,7 +146,7 @@ class PlayerChooser:
         self.handovers.next_waits, self.handovers.next_is_neural = command.next_waits, command.next_is_neural
 
     def required_rate(self, voice: str | None) -> int | None:
-        """Return the sample rate that a sound must have, or None if the player can play any rate.
+        """Return the sample rate that a sound must have in a WAV file, or None if any rate can be played.
 
         All samples in a WAV file have the same rate. A new file gets the rate of this voice.
         """

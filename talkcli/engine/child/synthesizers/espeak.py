@@ -244,10 +244,10 @@ class Espeak:
         self.choose_voice(next((each.id for each in found if each), self.voice))
 
     @contextlib.contextmanager
-    def phonemizer(self, language: str, *, phonemes: bool = False) -> Iterator[EspeakPhonemizer]:
+    def phonemizer(self, language: str, *, has_phonemes: bool = False) -> Iterator[EspeakPhonemizer]:
         """Provide a phonemizer for a language in a `with` block.
 
-        With `phonemes`, the marks `[[` and `]]` in a text enclose phonemes.
+        With `has_phonemes`, the marks `[[` and `]]` in a text enclose phonemes.
 
         Another thread may use the phonemizer during the block, but nothing may use the synthesizer. After the block,
         calls of the phonemizer raise Stopped. If a call is still running at the end of the block, it continues for a
@@ -260,7 +260,7 @@ class Espeak:
         self._finish_phonemizer()
         voice = self._find_voice(language)
         voice_id = voice.id if voice is not None else ""
-        self._phonemizer = phonemizer = EspeakPhonemizer(self._espeak, voice_id, phonemes=phonemes)
+        self._phonemizer = phonemizer = EspeakPhonemizer(self._espeak, voice_id, has_phonemes=has_phonemes)
         if not voice_id or self._espeak.SetVoiceByName(voice_id.encode()) != self._espeak.EE_OK:
             raise UnknownVoice(f'{self.version} has no voice "{language}", which this voice needs for its phonemes')
         self._espeak.SetParameter(self._espeak.RATE, _ESPEAK_DEFAULT_WPM, 0)
@@ -299,15 +299,15 @@ class EspeakPhonemizer:
     Args:
         espeak: pyttsx3's binding of the library.
         voice: The id of the library's current voice.
-        phonemes: Whether `[[` and `]]` in a text enclose phonemes.
+        has_phonemes: Whether `[[` and `]]` in a text enclose phonemes.
     """
 
-    def __init__(self, espeak: Any, voice: str, *, phonemes: bool = False) -> None:
+    def __init__(self, espeak: Any, voice: str, *, has_phonemes: bool = False) -> None:
         import threading
 
         self._espeak = espeak
         self._voice = voice
-        self._flags = espeak.CHARS_UTF8 | (_PHONEMES if phonemes else 0)
+        self._flags = espeak.CHARS_UTF8 | (_PHONEMES if has_phonemes else 0)
         #: a lock that is held during each call to the library
         self.busy = threading.Lock()
         self._ended = False

@@ -141,7 +141,7 @@ class Piper:
             raise CannotSpeak(Reason.UNKNOWN_VOICE, f"{self.voice}: {error}") from error
         try:
             sink.begin(description.rate, self.voice)
-            with self._espeak.phonemizer(description.espeak_voice, phonemes=settings.phonemes) as phonemizer:
+            with self._espeak.phonemizer(description.espeak_voice, has_phonemes=settings.phonemes) as phonemizer:
                 run = ModelRun()
                 phonemes = split_text(phonemizer, text, ends_text=settings.ends_text)
                 parts = _speak_parts(model, phonemes, speaker, settings, run)
