@@ -332,7 +332,7 @@ DEVICE_LISTS: dict[str, tuple[str, Callable[[ProgramOutput], Iterable[str]], str
 
 
 def with_pactl_hint(finding: Finding, env: Mapping[str, str]) -> Finding:
-    """Add a hint for installing pactl to a finding whose advice uses pactl. Return the finding."""
+    """Return a finding. If its advice uses pactl and pactl isn't installed, add a hint."""
     if finding.next is None or "pactl " not in finding.next or on_path("pactl", env):
         return finding
     return replace(finding, next=f"{finding.next} (to install pactl: sudo apt-get install -y {PACKAGES['pacat']})")

@@ -96,9 +96,9 @@ class FleetCalls(Generic[FleetRequestT]):
         return self._send_request(to, Status())
 
     def pause(self, to: str, seconds: float | None = None) -> FleetRequestT:
-        """Pause speech on each robot until `resume` is called. Return the request.
+        """Pause speech on each robot, for `seconds` or until `resume` is called. Return the request.
 
-        If `seconds` is given (0.1 to 86,400), the pause ends after this time.
+        `seconds` is 0.1 to 86,400. If it is None, only `resume` ends the pause.
         """
         return self._send_request(to, Pause(seconds))
 

@@ -938,10 +938,10 @@ class Scheduler:
         record = None if self.active or self.paused or not self.has_engine else self.next_goal()
         if record is None:
             return inf
-        return 0.0 if record.next_since == inf else self._start_time(record)
+        return 0.0 if record.next_since == inf else self._patience_end(record)
 
-    def _start_time(self, record: Record) -> float:
-        """Return the earliest monotonic time at which a goal may start instead of waiting for its voice."""
+    def _patience_end(self, record: Record) -> float:
+        """Return the monotonic time until which a goal waits for its voice, or 0 if it doesn't wait."""
         waits = self._loads_voices and not record.say.is_sound
         return self.voices.patience_end(record, self.wanted_voice(record)) if waits else 0.0
 
@@ -950,7 +950,7 @@ class Scheduler:
         for each in self.pending.interjections():
             if each.say.priority < priority:
                 break
-            if self._start_time(each) < inf:
+            if self._patience_end(each) < inf:
                 return each
         return None
 
@@ -995,7 +995,7 @@ class Scheduler:
         if record is None:
             return None, effects
         record.next_since = min(record.next_since, now.monotonic)
-        if self._start_time(record) > now.monotonic:
+        if self._patience_end(record) > now.monotonic:
             return None, effects
         self.active, last = record, self.interrupted[-1] if self.interrupted else None
         if record is last:

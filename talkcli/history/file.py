@@ -150,7 +150,7 @@ class HistoryWriter:
         return message
 
     def _is_clock_steady(self) -> bool:
-        """Return whether the clock has run long enough without being set."""
+        """Check if the clock was set. Return whether it has run long enough since then."""
         now = time.monotonic()
         offset = time.time() - now
         if abs(offset - self._clock_offset) > _CLOCK_TOLERANCE_S:

@@ -273,9 +273,9 @@ async def test_requests_of_all_clients_are_limited_to_4_mib_except_cancels(talk:
         refused.append([line for line in anna.lines(f"{user}/s1") if line.get("ok") is False])
     assert [bool(lines) for lines in refused] == [True, False, True], "olga may only use half of the space"
     assert {line["error"]["code"] for lines in refused for line in lines} == {"busy"}
-    assert (4 << 20) - 61_000 < anna.sessions.count_waiting_bytes() <= 4 << 20
+    assert (4 << 20) - 61_000 < anna.sessions.count_unanswered_bytes() <= 4 << 20
     assert (await anna.ask({"seq": 3, "request": "cancel"}, "another"))["ok"]
-    assert anna.sessions.count_waiting_bytes() == 0
+    assert anna.sessions.count_unanswered_bytes() == 0
     anna.sessions.end_all()
 
 

@@ -266,7 +266,7 @@ class Checked(Robot):
         assert all(scheduler.find(record.id) is record for record in scheduler.unfinished())
         following = scheduler.next_goal()
         if following and not (scheduler.active or scheduler.paused) and scheduler.has_engine:
-            waits_for_voice = scheduler._start_time(following) > self.seconds
+            waits_for_voice = scheduler._patience_end(following) > self.seconds
             deadline = scheduler.deadline()
             is_due = deadline <= self.seconds  # the next tick starts the goal
             assert waits_for_voice or is_due, "a goal waits without a reason"

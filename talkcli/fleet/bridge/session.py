@@ -167,7 +167,7 @@ class RemoteSessions:
         """Remove a session that has ended."""
         self._sessions = {key: each for key, each in self._sessions.items() if each is not session}
 
-    def count_waiting_bytes(self, user: str | None = None) -> int:
+    def count_unanswered_bytes(self, user: str | None = None) -> int:
         """Return the total size of the unanswered requests of a user, or of all users."""
         sessions = [each for each in self._sessions.values() if user in (None, each.user)]
         return sum(each.size_bytes for session in sessions for each in session.unanswered)
@@ -311,7 +311,7 @@ class RemoteSession:
         urgent = isinstance(request.request, Cancel | Status)
         limit = 2 * MAX_WAITING_BYTES if urgent else MAX_WAITING_BYTES
         shared = self._sessions
-        waiting_bytes = max(shared.count_waiting_bytes(), 2 * shared.count_waiting_bytes(self.user))
+        waiting_bytes = max(shared.count_unanswered_bytes(), 2 * shared.count_unanswered_bytes(self.user))
         if isinstance(request.request, Log) and request.request.grep is not None and not self._sessions.with_text:
             self.refuse(request, "not_allowed", "the robot's bridge hides all texts (--no-text), so leave out grep")
         elif len(self.unanswered) >= MAX_WAITING_REQUESTS:

@@ -153,16 +153,16 @@ class RobotConnection(Connection):
             AccessDenied: The broker rejected the login, or its certificate is not trusted.
             UsageError: The name of the robot or the sender is not allowed.
         """
-        give_up = time.monotonic() + keep_trying_s
+        give_up_at = time.monotonic() + keep_trying_s
         while True:
             desk = DeskLink(broker, cls.wait)
             try:
                 desk.handler = connection = cls(robot, desk, **options)
-                await connection.wait_online(give_up)
+                await connection.wait_online(give_up_at)
                 return connection
             except BaseException as error:
                 desk.close()
-                left = give_up - time.monotonic()
+                left = give_up_at - time.monotonic()
                 if not isinstance(error, ServerUnavailable) or left <= 0:
                     raise
             await cls.wait({}, min(_CONNECT_PAUSE_S, left), options.get("interrupt"))
@@ -386,16 +386,16 @@ class RobotConnection(Connection):
 
     # -- connecting
 
-    async def wait_online(self, give_up: float) -> None:
-        """Wait until the robot can receive requests. Raise an error if it can't by `give_up`.
+    async def wait_online(self, give_up_at: float) -> None:
+        """Wait until the robot can receive requests. Raise an error if it can't by `give_up_at`.
 
-        `give_up` is a monotonic time. The errors are the same as those of `open`.
+        `give_up_at` is a monotonic time. The errors are the same as those of `open`.
         """
         left = self._patience if self._end is None else max(0.0, self._end - time.monotonic())
         await self._desk.wait_for_retained(min(self._patience, left), lambda: bool(self._presence), self._interrupt)
-        while self.absent_since is not None and self._desk.link and (left := give_up - time.monotonic()) > 0:
+        while self.absent_since is not None and self._desk.link and (left := give_up_at - time.monotonic()) > 0:
             await self._desk.poll(left, self._interrupt)
-        self._patience = max(self._patience, round(give_up - time.monotonic(), 1))
+        self._patience = max(self._patience, round(give_up_at - time.monotonic(), 1))
         if not self._presence:
             words = f"no robot '{self.robot}' is known at {self._desk.broker.url}, so nothing was sent"
             raise ServerUnavailable(f"{words}; on the robot, run: talk bridge --name {self.robot}")
