@@ -32,13 +32,8 @@ def joe(tmp_path_factory: pytest.TempPathFactory) -> Joe:
     return Joe(str(folder), str(tmp_path_factory.mktemp("cache")))
 
 
-@pytest.fixture(params=["espeak", pytest.param("joe", marks=pytest.mark.slow)])
+@pytest.fixture
 def voice(request: pytest.FixtureRequest) -> Voice:
-    """The voice of a test's servers: the neural voice only in slow runs, unless the test is marked `with_both`.
-
-    A server takes a second to load it. One test of each kind is marked: spoken, stopped, queued, paused.
-    """
-    if request.param == "espeak":
-        return ESPEAK
-    joe_voice: Joe = request.getfixturevalue("joe")
-    return joe_voice
+    """The voice of a test's servers: the neural voice only for one test of each kind, which is marked `with_both`."""
+    chosen: Voice = request.getfixturevalue("joe") if getattr(request, "param", "") == "joe" else ESPEAK
+    return chosen

@@ -61,7 +61,7 @@ def _until_connected(wire: Wire, clients: int) -> None:
 def test_row_08_a_client_times_out_while_the_server_is_frozen(scripted: Talk) -> None:
     with limits():
         started_at = time.monotonic()
-        client = scripted.start("say", "--wait", "--timeout", "2", "--", "never-ends words=1")
+        client = scripted.start("say", "--wait", "--timeout", "0.5", "--", "never-ends words=1")
         goal_id = scripted.watcher.wait_for(None, "ACTIVE")["id"]
         scripted.freeze()
         try:
@@ -70,33 +70,31 @@ def test_row_08_a_client_times_out_while_the_server_is_frozen(scripted: Talk) ->
         finally:
             scripted.thaw()
         assert done.code == 124
-        assert seconds >= 2
+        assert seconds >= 0.5
         assert "did not confirm" in done.err
         assert scripted.watcher.wait_for_terminal(goal_id) == "PREEMPTED"  # the client had sent its cancel
-        assert scripted.goal(goal_id)["state"] == "PREEMPTED"
-        assert_within(seconds, 2 + 1 + START, "a timeout of 2 s, and 1 s for silence")
+        assert_within(seconds, 0.5 + 1 + START, "a timeout of 0.5 s, and 1 s for silence")
 
 
 def test_row_10_a_timeout_cancels_the_goal(scripted: Talk) -> None:
     with limits():
         started_at = time.time()
-        done = scripted.run("--json", "say", "--wait", "--timeout", "2", "length=10 words=1")
+        done = scripted.run("--json", "say", "--wait", "--timeout", "0.5", "length=10 words=1")
         goal = json.loads(done.out)
         assert (done.code, goal["state"], goal["reason"]) == (124, "PREEMPTED", "canceled")
-        error = {"code": "timeout", "exit": 124, "message": "timed out after 2 s"}
+        error = {"code": "timeout", "exit": 124, "message": "timed out after 0.5 s"}
         assert json.loads(done.err.splitlines()[-1]) == {"error": error}
-        assert goal["ended_at"] - started_at >= 2
-        assert_within(goal["ended_at"] - started_at, 2 + 0.3, "a timeout of 2 s")
-        assert_within(done.seconds, 2 + START, "a client with a timeout of 2 s")
+        assert goal["ended_at"] - started_at >= 0.5
+        assert_within(goal["ended_at"] - started_at, 0.5 + 0.3, "a timeout of 0.5 s")
+        assert_within(done.seconds, 0.5 + START, "a client with a timeout of 0.5 s")
 
 
 def test_row_10_a_timeout_includes_the_time_in_the_queue(scripted: Talk) -> None:
     scripted.run("say", "never-ends")
-    done = scripted.run("--json", "say", "--wait", "--timeout", "0.5", "behind it")
+    done = scripted.run("--json", "say", "--wait", "--timeout", "0.2", "behind it")
     goal = json.loads(done.out)
     assert (done.code, goal["state"]) == (124, "RECALLED")
-    watched = scripted.run("wait", "--timeout", "0.3")
-    assert watched.code == 124
+    assert scripted.run("wait", "--timeout", "0.2").code == 124
     assert scripted.request("status")["active"]["state"] == "ACTIVE"  # `wait` cancels nothing
 
 
@@ -132,14 +130,6 @@ def test_row_15_a_goal_is_spoken_even_if_its_client_disconnects_at_once(scripted
     assert {scripted.watcher.wait_for_terminal(goal_id) for goal_id in goals} == {"SUCCEEDED"}
     for line in scripted.log.splitlines():
         assert " SUCCEEDED after " in line or " ready" in line, line  # nothing about disconnected clients
-
-
-def test_row_15_a_goal_is_spoken_even_if_its_client_is_killed(scripted: Talk) -> None:
-    client = scripted.start("say", "--wait", "--", "length=0.5")
-    goal_id = scripted.watcher.wait_for(None, "ACTIVE")["id"]
-    client.kill()
-    client.wait()
-    assert scripted.watcher.wait_for_terminal(goal_id) == "SUCCEEDED"
 
 
 def test_row_31_any_process_can_get_the_result_of_an_ended_goal(scripted: Talk) -> None:

@@ -52,17 +52,6 @@ def test_a_text_grows_and_watching_clients_see_how(soundless: Talk) -> None:
     assert [event["word"] for event in events if event["event"] == "word"] == ["One", "Two"]
 
 
-def test_missing_text_is_feedback_and_ends_the_goal_after_the_limit(soundless: Talk) -> None:
-    with soundless.connect() as client:
-        goal_id = begin(client, stall=1, feedback=True)
-        client.receive_event("word")
-        client.receive_event("waits", waits=True)
-        assert client.request("status", id=goal_id)["goal"]["waits"]
-        goal = result(client)
-    assert (goal["state"], goal["reason"], goal["spoken"]) == ("ABORTED", "text_stalled", "One")
-    assert goal["message"] == "speech failed: no more text arrived for 1 s"
-
-
 def test_a_long_block_of_code_does_not_hold_its_sender_back(soundless: Talk) -> None:
     code = "```\n" + "x = 1\n" * 1_500
     with soundless.connect() as client:

@@ -8,21 +8,10 @@ import subprocess
 from typing import TYPE_CHECKING
 
 from tests.conformance.bareserve import TALK
-from tests.conformance.rawsocket import Raw
 
 if TYPE_CHECKING:
     from tests.support.processes import Finished, Talk
-
-INVALID = {
-    "empty": "",
-    "blanks": " \t\n\u3000 ",
-    "only a zero-width space": "\u200b",
-    "only controls": "\x07\x1b",
-    "NUL": "battery\0low",
-    "half of a surrogate pair": "battery \ud83d low",
-}
-TOO_LONG = {"10,001 characters": "a" * 10_001, "10,001 wide characters": "é" * 10_001}
-WHOLE = ["a" * 10_000, "😀" * 10_000, "😀 low", 'it\'s "$(touch hacked)"; `id`\n& done']
+WHOLE = ["😀" * 10_000, 'it\'s "$(touch hacked)"; `id`\n& done']
 
 
 class Bystanders:
@@ -47,34 +36,13 @@ def assert_rejected(done: Finished, reason: str) -> None:
     assert "not spoken: " in done.err
 
 
-def test_row_13_a_text_that_cannot_be_spoken_is_rejected_on_the_wire(scripted: Talk) -> None:
-    bystanders = Bystanders(scripted)
-    cases = [(name, text, "invalid_text") for name, text in INVALID.items()]
-    cases += [(name, text, "text_too_long") for name, text in TOO_LONG.items()]
-    with Raw(scripted.socket) as raw:
-        raw.receive_lines(1)
-        for number, (name, text, reason) in enumerate(cases):
-            request = {"seq": number, "request": "say", "text": text, "wait": True, "preempt": True}
-            raw.send(json.dumps(request).encode() + b"\n")
-            reply, state, result = raw.receive_lines(1 + 3 * (number + 1))[-3:]
-            assert reply["seq"] == number
-            assert reply["ok"], name
-            for goal in (reply["goal"], result["goal"]):
-                assert (goal["state"], goal["reason"]) == ("REJECTED", reason), name
-                assert goal["message"].startswith("not spoken: "), name
-                assert goal["started_at"] is None
-                assert goal["text"] == text
-            assert (state["event"], state["state"]) == ("state", "REJECTED")
-            bystanders.assert_untouched()
-
-
 def test_row_13_a_text_that_cannot_be_spoken_is_rejected_by_say(scripted: Talk) -> None:
     bystanders = Bystanders(scripted)
     for text in ("", "  ", "\u200b"):
         assert_rejected(scripted.run("--json", "say", "--preempt", "--wait", "--", text), "invalid_text")
     for text in ("", "\n", "\u200b\r\n", "battery\0low"):
         assert_rejected(scripted.run("--json", "say", "--preempt", "-", stdin=text), "invalid_text")
-    for text in ("a " * 50_000, "é" * 50_000, "a" * 10_001):
+    for text in ("é" * 50_000, "a" * 10_001):
         assert_rejected(scripted.run("--json", "say", "--preempt", "-", stdin=text), "text_too_long")
         assert_rejected(scripted.run("--json", "say", "--preempt", text), "text_too_long")
     plain = scripted.run("say", "--preempt", "--wait", "--", "")
@@ -114,22 +82,13 @@ def test_invalid_utf8_bytes_are_skipped_and_reported(scripted: Talk) -> None:
             assert done.stderr.decode() == expected
 
 
-def test_invalid_utf8_bytes_are_silent_and_are_not_words(talk: Talk) -> None:
+def test_invalid_utf8_bytes_are_silent_and_are_not_words(soundless: Talk) -> None:
     command: list[str | bytes] = [*TALK, "say", "--feedback", "--", b"battery \xff low, it\xffs \xff", "now"]
-    done = subprocess.run(command, env=talk.env, capture_output=True, text=True, timeout=20, check=False)
+    done = subprocess.run(command, env=soundless.env, capture_output=True, text=True, timeout=20, check=False)
     words = [line.split()[-1] for line in done.stdout.splitlines() if " word " in line]
     assert (done.returncode, words) == (0, ["battery", "low", "it", "s", "now"])
-    alone = talk.run("say", "--wait", "--", "\udcff")
+    alone = soundless.run("say", "--wait", "--", "\udcff")
     assert (alone.code, alone.err.splitlines()[-1].endswith("nothing in the text can be spoken")) == (4, True)
-
-
-def test_row_13_a_line_of_100_kilobytes_is_refused(scripted: Talk) -> None:
-    bystanders = Bystanders(scripted)
-    with Raw(scripted.socket) as raw:
-        raw.send(json.dumps({"request": "say", "text": "a" * 100_000, "preempt": True}).encode() + b"\n")
-        _, reply = raw.receive_all()
-    assert (reply["ok"], reply["error"]["code"]) == (False, "line_too_long")
-    bystanders.assert_untouched()
 
 
 def test_texts_are_spoken_unchanged(scripted: Talk) -> None:

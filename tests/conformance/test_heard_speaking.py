@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.engine.child.players.chooser import MAX_CUT_S
 from tests.conformance import stopped
-from tests.conformance.hearing import HELP, HOME, LONG, LOW, assert_aborted, await_word, heard, send
+from tests.conformance.hearing import HOME, LONG, LOW, assert_aborted, await_word, heard, send
 from tests.conformance.voices import ESPEAK, with_both
 from tests.support.compare import (
     EXTENT_TOLERANCE_S,
@@ -35,15 +34,13 @@ from tests.support.timing import assert_within, limits
 if TYPE_CHECKING:
     import pathlib
 
-    from tests.conformance.voices import Joe, Voice
+    from tests.conformance.voices import Voice
     from tests.conftest import MakeTalk
     from tests.support.connection import Message
     from tests.support.processes import Finished, Talk
     from tests.support.sink import Sink
 
 SPOKEN = ["PENDING", "ACTIVE", "SUCCEEDED"]
-#: Seconds that the monitor may drop at the start of a stream.
-LOST = 0.012
 
 
 def test_row_01_a_goal_is_spoken_and_its_end_is_reported(talk: Talk) -> None:
@@ -61,7 +58,7 @@ def test_row_01_a_goal_is_spoken_and_its_end_is_reported(talk: Talk) -> None:
 @with_both
 def test_row_23_goals_are_spoken_in_the_order_they_were_sent(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
     talk = voice.serve(make_talk, sink)
-    texts = [HELP, LOW, HOME]
+    texts = [LOW, HOME]
     sent = [talk.run("say", "--", text).id for text in texts]
     done = talk.run("wait", *sent)
     assert (done.code, done.err) == (0, "")
@@ -72,30 +69,22 @@ def test_row_23_goals_are_spoken_in_the_order_they_were_sent(make_talk: MakeTalk
 
 def test_row_18_a_cancelled_pending_goal_is_never_spoken(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
     talk = voice.serve(make_talk, sink)
-    texts = [LONG, LOW, "never to be heard", HOME]
-    active, first, second, third = [send(talk, text) for text in texts]
+    active, second, third = [send(talk, text) for text in (LONG, "never to be heard", HOME)]
     talk.watcher.wait_for_word(active)
     canceled = talk.run("cancel", second)
     assert (canceled.code, canceled.id, canceled.err) == (0, second, "")
     assert talk.goal(active)["state"] == "ACTIVE"
     assert talk.watcher.states(second) == ["PENDING", "RECALLED"]
-    goal = talk.goal(second)
-    assert (goal["state"], goal["reason"]) == ("RECALLED", "canceled")
+    assert talk.goal(second)["reason"] == "canceled"
     assert talk.watcher.wait_for_terminal(third, 10) == "SUCCEEDED"
-    assert talk.watcher.states(active) == talk.watcher.states(first) == SPOKEN
-    del texts[2]
-    assert_heard(heard(talk), voice.render(texts))
+    assert talk.watcher.states(active) == SPOKEN
+    assert_heard(heard(talk), voice.render([LONG, HOME]))
 
 
 def test_row_30_a_text_is_spoken_and_never_executed(
     make_talk: MakeTalk, sink: Sink, tmp_path: pathlib.Path, voice: Voice, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    texts = [
-        "$(touch x) `touch x`",
-        "it's \"a\" '; touch x; ' | touch x & touch y",
-        "one\ntouch x\nlow \U0001f600 %s \\n",
-        "-5",
-    ]
+    texts = ["$(touch x) `touch x`", "it's \"a\" '; touch x & touch y", "one\n\U0001f600 %s", "-5"]
     monkeypatch.chdir(tmp_path)  # server and clients run in this directory
     talk = voice.serve(make_talk, sink)
     refused = talk.run("say", "--wiat", LOW)
@@ -107,25 +96,6 @@ def test_row_30_a_text_is_spoken_and_never_executed(
     assert talk.run("say", "--wait", *LOW.split()).code == 0  # arguments are joined
     assert_heard(heard(talk), voice.render([*texts, LOW]))
     assert os.listdir(tmp_path) == []
-
-
-def test_only_a_limited_silence_is_cut_between_queued_sentences(talk: Talk) -> None:
-    """Enough of the pause between two sentences must be left, however fast goals change."""
-    texts = [LOW, HOME, LOW]
-    goals = [send(talk, text) for text in texts]
-    assert talk.watcher.wait_for_terminal(goals[-1], 20) == "SUCCEEDED"
-    references = render(texts)
-    comparisons = assert_heard(heard(talk), references)
-    for number in range(len(texts) - 1):
-        before, after = (extent(reference) for reference in references[number : number + 2])
-        assert before is not None
-        assert after is not None
-        own = (len(references[number]) - before[1] + after[0]) / RATE
-        pause = (comparisons[number + 1].offset - comparisons[number].offset) / RATE - comparisons[number].expected
-        assert pause > own - MAX_CUT_S - LOST
-        whole = len(references[number]) / RATE
-        assert whole - MAX_CUT_S <= talk.goal(goals[number])["duration"] <= whole + 0.001
-    assert abs(talk.goal(goals[-1])["duration"] - len(references[-1]) / RATE) < 0.001
 
 
 #: ALSA settings for a card that does not exist.
@@ -216,7 +186,7 @@ class Measured:
             assert_within(worst, WORST, f"the worst of words, as {name},")
 
 
-def measure(talk: Talk, text: str, rate: int, *, exact: bool = True, voice: Voice = ESPEAK) -> Measured:
+def measure(talk: Talk, text: str, rate: int, *, exact: bool = True) -> Measured:
     """Speak a server's first sentence, stop the server, and return the measurement.
 
     Args:
@@ -226,7 +196,7 @@ def measure(talk: Talk, text: str, rate: int, *, exact: bool = True, voice: Voic
     done = talk.run("say", "--wait", "--", text, timeout=60)
     assert (done.code, done.err) == (0, "")
     samples = heard(talk)
-    reference = voice.render_with_words(Sentence(text, rate))
+    reference = ESPEAK.render_with_words(Sentence(text, rate))
     compared = compare(samples, reference.samples)
     words = talk.watcher.words(done.id)
     if compared.heard > compared.expected + EXTENT_TOLERANCE_S:
@@ -247,37 +217,12 @@ def position(reference: Rendering, start: int) -> float:
     return next(seconds for offset, _, seconds in reference.words if offset == start)
 
 
-@pytest.mark.parametrize(
-    ("player", "rate"),
-    [
-        ("aplay", 350),
-        ("pulse", 350),
-        *(pytest.param("aplay", rate, marks=pytest.mark.slow) for rate in (100, 200)),
-        *(pytest.param("pacat", rate, marks=pytest.mark.slow) for rate in (200, 350)),
-        *(pytest.param("pulse", rate, marks=pytest.mark.slow) for rate in (100, 200)),
-    ],
-)
-def test_word_events_arrive_as_the_words_are_heard(make_talk: MakeTalk, sink: Sink, player: str, rate: int) -> None:
+@pytest.mark.parametrize("player", ["aplay", "pulse"])
+def test_word_events_arrive_as_the_words_are_heard(make_talk: MakeTalk, sink: Sink, player: str) -> None:
     with limits():
-        talk = make_talk("--rate", str(rate), "--player", player, sink=sink)
-        measured = measure(talk, FIFTEEN, rate)
+        talk = make_talk("--rate", "350", "--player", player, sink=sink)
+        measured = measure(talk, FIFTEEN, 350)
         assert [FIFTEEN[word["start"] : word["end"]] for word in measured.words] == REPORTED_WORDS
-        measured.assert_in_time()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("rate", [200, 300])
-def test_word_events_of_a_neural_voice_arrive_as_the_words_are_heard(
-    make_talk: MakeTalk, sink: Sink, joe: Joe, rate: int
-) -> None:
-    with limits():
-        measured = measure(joe.serve(make_talk, sink, rate=rate), FIFTEEN, rate, voice=joe)
-        assert [FIFTEEN[word["start"] : word["end"]] for word in measured.words] == REPORTED_WORDS
-        # The reported place of a word in the sound doesn't depend on the load of the machine.
-        reference = joe.render_with_words(Sentence(FIFTEEN, rate))
-        errors = [abs(word["time"] - position(reference, word["start"])) for word in measured.words]
-        assert statistics.median(errors) <= MEDIAN, errors
-        assert max(errors) <= WORST, errors
         measured.assert_in_time()
 
 
@@ -285,42 +230,30 @@ def test_word_events_wait_for_an_output_with_high_latency(make_talk: MakeTalk, s
     """With the engine's own clock, the events would come 200 ms too early."""
     with limits(), DistantSink(sink) as distant:
         talk = make_talk("--rate", "350", sink=sink, env=distant.env)
-        measure(talk, FIFTEEN, 350, exact=False).assert_in_time()
+        measure(talk, "coming home to the charger in the kitchen", 350, exact=False).assert_in_time()
 
 
 def test_row_42_words_of_any_script_are_reported_once_with_their_place(make_talk: MakeTalk, sink: Sink) -> None:
     with limits():
         measured = measure(make_talk("--rate", "350", sink=sink), TEN, 350)
-        _assert_ten(measured.words)
-        assert measured.words[0]["time"] == 0
         measured.assert_in_time()
-
-
-@pytest.mark.slow
-def test_row_42_a_neural_voice_reports_words_of_any_script_once(make_talk: MakeTalk, sink: Sink, joe: Joe) -> None:
-    """Their times can't be checked, because the recognizer knows only English words."""
-    talk = joe.serve(make_talk, sink, rate=200)
-    done = talk.run("say", "--wait", "--", TEN)
-    assert (done.code, done.err) == (0, "")
-    _assert_ten(talk.watcher.words(done.id))
-
-
-def _assert_ten(words: list[Message]) -> None:
+    words = measured.words
     assert [word["word"] for word in words] == ["coming", "from", "café", "東京", "is", "😀", "naïve", "this"]
     assert [word["start"] for word in words] == [TEN.index(word["word"]) for word in words]
     assert [word["end"] - word["start"] for word in words] == [len(word["word"]) for word in words]
     assert [word["number"] for word in words] == list(range(1, 9))
     times = [word["time"] for word in words]
+    assert times[0] == 0
     assert times == sorted(times)
 
 
-def test_row_42_a_stopped_goal_reports_the_words_that_were_heard(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
-    reference = voice.render_with_words(Sentence(LONG))
+def test_row_42_a_stopped_goal_reports_the_words_that_were_heard(make_talk: MakeTalk, sink: Sink) -> None:
+    reference = ESPEAK.render_with_words(Sentence(LONG))
     bounds = extent(reference.samples)
     assert bounds is not None
 
     with limits():
-        talk = voice.serve(make_talk, sink, rate=200)
+        talk = ESPEAK.serve(make_talk, sink, rate=200)
         goal_id = send(talk, LONG)
         await_word(talk, goal_id, 5)
         assert talk.request("cancel", ids=[goal_id])["ok"]

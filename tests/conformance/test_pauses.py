@@ -76,19 +76,6 @@ def test_a_stopped_listener_pauses_speech_no_longer_than_its_limit(scripted: Tal
         listener.kill()
 
 
-def test_the_status_shows_the_pause_that_ends_last(scripted: Talk) -> None:
-    with start_listener(scripted, seconds=60) as listener, scripted.connect() as other:
-        other.request("hello", name="other")
-        assert other.request("pause", seconds=30)["paused_by"]["client"]["name"] == "listener"
-        assert other.request("pause", seconds=90)["paused_by"]["client"]["name"] == "other"
-        reply = other.request("pause")
-        assert (reply["paused_by"]["client"]["name"], reply["paused_until"]) == ("other", None)
-        said = other.request("say", text="length=0")
-        assert {name: said[name] for name in NULLS} == pause_state(scripted)
-        assert {name: other.request("resume")[name] for name in NULLS} == NULLS == pause_state(scripted)
-        listener.kill()
-
-
 def test_a_pause_ends_with_the_input_of_its_client(scripted: Talk) -> None:
     with scripted.connect() as client:
         client.request("pause", while_connected=True)

@@ -79,13 +79,6 @@ def test_the_system_service_serves_in_its_runtime_directory(home: str) -> None:
         assert f"ready on {home}/run/talk.sock" in server.log
 
 
-def test_an_unknown_voice_stops_the_server_with_exit_code_2(home: str) -> None:
-    done = run([*TALK, "serve", "--player", "null", "--socket", f"{home}/s", "--voice", "germn"], environment(home))
-    assert (done.code, done.out) == (2, "")
-    assert ('"germn"' in done.err, "'German'" in done.err) == (True, True)
-    assert not os.path.exists(f"{home}/s")
-
-
 def test_the_greeting_is_spoken_at_the_start(make_talk: MakeTalk) -> None:
     talk = make_talk("--greeting", "length=0 at your service", scripted=True, watched=False)
     with talk.connect() as wire:

@@ -15,11 +15,9 @@ import numpy as np
 import pytest
 
 from tests.conformance.hearing import QUICK
-from tests.support.espeak import RATE
 from tests.support.neural_server import serve_with_voice
 from tests.support.processes import run_talk
 from tests.support.real_voice import REAL_VOICE
-from tests.support.recognizer import WORD, align
 from tests.support.reference import Rendering, Sentence, render, render_with_words
 from tests.support.surroundings import clean_environment
 
@@ -35,11 +33,9 @@ if TYPE_CHECKING:
     Samples = npt.NDArray[np.int16]
     Environment = Mapping[str, str] | None
 
-#: Marks a test that runs with both voices in the default run, too.
+#: Marks a test that runs with both voices.
 with_both = pytest.mark.parametrize("voice", ["espeak", "joe"], indirect=True)
 
-#: Seconds of a block of samples, number of blocks in a pause, and maximum value of a silent sample.
-_BLOCK, _PAUSE, _SILENT = 0.01, 8, 50
 #: Limit in seconds for rendering a sentence, including the loading of its voice.
 _PATIENCE = 30.0
 
@@ -80,15 +76,6 @@ class Joe:
     def render(self, sentences: Sequence[str | Sentence], rate: int = QUICK) -> list[Samples]:
         return [self._rendered(text if isinstance(text, Sentence) else Sentence(text, rate)) for text in sentences]
 
-    def render_with_words(self, sentence: Sentence) -> Rendering:
-        """Return the samples, with the words at the places where a speech recognizer finds them."""
-        samples = self._rendered(sentence)
-        words = WORD.finditer(sentence.text.lower())
-        heard = align(samples, sentence.text)
-        ends = [*(word.begin for word in heard[1:]), len(samples) / RATE]
-        starts = [_skip_pause(samples, word.begin, end) for word, end in zip(heard, ends, strict=True)]
-        return Rendering(samples, tuple((*at.span(), start) for at, start in zip(words, starts, strict=True)))
-
     @property
     def places(self) -> dict[str, str]:
         return {"TALK_VOICES": self.voices, "XDG_CACHE_HOME": self.cache}
@@ -107,15 +94,3 @@ class Joe:
 
 
 Voice = Espeak | Joe
-
-
-def _skip_pause(samples: Samples, begin: float, end: float) -> float:
-    """Return where the sound of a word starts, because a recognizer includes the pause before it."""
-    silent = [
-        int(np.abs(samples[int(at * RATE) : int((at + _BLOCK) * RATE)]).max(initial=0)) < _SILENT
-        for at in np.arange(begin, end, _BLOCK)
-    ]
-    for at in range(_PAUSE):
-        if all(silent[at : at + _PAUSE]) and False in silent[at + _PAUSE :]:
-            return begin + silent.index(False, at) * _BLOCK
-    return begin

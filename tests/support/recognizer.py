@@ -1,14 +1,13 @@
-"""Speech recognition with pocketsphinx: which of some sentences was spoken, and when was each word spoken?
+"""Speech recognition with pocketsphinx: which of some sentences was spoken?
 
-pocketsphinx needs 16,000 samples per second, and has a resolution of 10 ms. Its wheel includes the model. Only CI
+pocketsphinx needs 16,000 samples per second. Its wheel includes the model. Only CI
 installs it, because 29 MB are too much for `.[test]`.
 """
 
 from __future__ import annotations
 
 import functools
-import re
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,10 +22,8 @@ if TYPE_CHECKING:
     Samples = npt.NDArray[np.int16]
 
 PACKAGE = "pocketsphinx"
-#: A word in lower case.
-WORD = re.compile(r"[a-z']+")
-#: pocketsphinx's samples and frames per second.
-_RECOGNIZER_RATE, _FRAME_RATE = 16000, 100
+#: pocketsphinx's samples per second.
+_RECOGNIZER_RATE = 16000
 #: Silence that is added at both ends, because the model needs some.
 _PADDING_S = 0.3
 #: Level of the noise that is added, as in a quiet room: 64 dB below full scale. The model wasn't trained with digital
@@ -34,19 +31,7 @@ _PADDING_S = 0.3
 _NOISE = 20
 #: Wide beams keep unlikely hypotheses. This is affordable, because there are only a few sentences.
 _BEAMS = {"beam": 1e-80, "pbeam": 1e-80, "wbeam": 1e-60}
-#: Silence is quieter than this level (1/100 of full scale) for this time, which is longer than a closure in a word.
-_SILENCE_LEVEL, _SILENCE_S = 327, 0.1
 _RANGE = (-32768, 32767)
-#: Segments that aren't words.
-_NO_WORD = re.compile(r"[<\[]")
-
-
-class HeardWord(NamedTuple):
-    """A word with its begin and end in seconds from the first sample."""
-
-    word: str
-    begin: float
-    end: float
 
 
 def recognize(samples: Samples, sentences: Iterable[str]) -> str:
@@ -58,28 +43,6 @@ def recognize(samples: Samples, sentences: Iterable[str]) -> str:
     _process(decoder, samples)
     hypothesis = decoder.hyp()
     return str(hypothesis.hypstr) if hypothesis else ""
-
-
-def align(samples: Samples, text: str) -> list[HeardWord]:
-    """Return the time of each word of a sentence. Raise AssertionError if the sentence wasn't recognized.
-
-    The recognizer counts the silence before a word as a part of it. This function doesn't.
-    """
-    words = WORD.findall(text.lower())
-    decoder = _decoder()
-    decoder.set_align_text(" ".join(words))
-    _process(decoder, samples)
-    heard = [
-        HeardWord(
-            re.sub(r"\(\d+\)$", "", segment.word),
-            _skip_silence(samples, _seconds(segment.start_frame)),
-            _seconds(segment.end_frame + 1),
-        )
-        for segment in decoder.seg() or ()
-        if not _NO_WORD.match(segment.word)
-    ]
-    assert [word.word for word in heard] == words, f"{text!r} was not heard, but {heard}"
-    return heard
 
 
 @functools.cache
@@ -98,20 +61,6 @@ def _process(decoder: Any, samples: Samples) -> None:
     decoder.start_utt()
     decoder.process_raw(np.clip(sound + noise, *_RANGE).astype("<i2").tobytes(), full_utt=True)
     decoder.end_utt()
-
-
-def _skip_silence(samples: Samples, begin: float) -> float:
-    """Return the end of the silence at this time, or the time itself if there is no silence."""
-    loud = np.flatnonzero(np.abs(samples.astype(np.int32)) > _SILENCE_LEVEL)
-    place = int(np.searchsorted(loud, begin * RATE))
-    if place == len(loud):
-        return begin
-    before = loud[place - 1] if place else -len(samples)
-    return float(loud[place]) / RATE if loud[place] - before > _SILENCE_S * RATE else begin
-
-
-def _seconds(frame: int) -> float:
-    return frame / _FRAME_RATE - _PADDING_S
 
 
 def resample(samples: Samples, rate: int, wanted: int) -> Samples:
