@@ -14,7 +14,6 @@ import pytest
 from talkcli import install
 from talkcli.install import NEURAL_PACKAGES
 from tests.conformance.bareserve import TALK, environment, run, serving
-from tests.engine.test_neural import NEURAL_MODULES
 from tests.support import tiny_voice, usage
 from tests.support.import_recorder import imported, record_imports
 from tests.support.processes import children
@@ -62,6 +61,12 @@ def test_without_the_extra_fleet_commands_name_the_missing_package(arguments: li
 # Neural voices
 
 
+#: Modules that an engine process doesn't need if no neural voice speaks.
+NEURAL_MODULES = [
+    *NEURAL_PACKAGES,
+    *("difflib", "hashlib", "queue"),
+    *(f"talkcli.engine.child.synthesizers.{name}" for name in ("inference", "loader", "phonemes", "piper", "vits")),
+]
 #: Modules that only neural voices use. A server needs the other `NEURAL_MODULES` anyway.
 NEURAL_ONLY = {*NEURAL_PACKAGES, *(name for name in NEURAL_MODULES if name.startswith("talkcli."))}
 #: How much the memory of two starts may differ.

@@ -233,6 +233,14 @@ class Engine:
         assert self.process.stderr is not None
         return self.process.stderr.readline().decode().strip()
 
+    def errors_so_far(self) -> bytes:
+        """Return what the process has written to standard error and was not read, without waiting."""
+        assert self.process.stderr is not None
+        os.set_blocking(self.process.stderr.fileno(), False)
+        data: bytes | None = self.process.stderr.read()
+        os.set_blocking(self.process.stderr.fileno(), True)
+        return data or b""
+
     def all_gone(self, seconds: float = 2.0) -> bool:
         """Return whether the process and its player end within this time."""
         os.set_blocking(self.liveness, False)

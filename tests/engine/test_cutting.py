@@ -262,40 +262,12 @@ def test_the_time_grows_with_the_text_only(text: str, size: int) -> None:
 
 #: Texts that must not be cut inside, and some between which one may cut.
 WHOLE = [
-    "e\u0301",
-    "👩\u200d🚀",
-    "❤\ufe0f",
-    "👍🏽",
-    "🇩🇪",
-    "1,000",
-    "3.14",
-    "10:30",
-    "v1.2.3",
-    "a@b.org",
-    "https://a.b/c?d=e.f",
+    *("e\u0301", "👩\u200d🚀", "❤\ufe0f", "👍🏽", "🇩🇪", "1,000", "3.14", "10:30", "v1.2.3"),
+    *("a@b.org", "https://a.b/c?d=e.f"),
 ]
 BETWEEN = [
-    " ",
-    " ",
-    " ",
-    "\n",
-    "\n\n",
-    "\n- ",
-    ". ",
-    ".",
-    "! ",
-    "?",
-    ", ",
-    ",",
-    " – ",
-    "—",
-    "。",
-    "，",
-    "“",
-    "”",
-    '"',
-    "...",
-    ": ",
+    *(" ", " ", " ", "\n", "\n\n", "\n- ", ". ", ".", "! ", "?", ", ", ",", " – ", "—", "。", "，"),
+    *("“", "”", '"', "...", ": "),
 ]
 WORDS = ["the", "The", "word", "Dr", "etc", "am", "a", "I", "你好", "门", "longer" * 9]
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from tests.support.sink import Sink
 
-TEXT = "I found the charger. It is near the door, behind the table. Shall I go there now?"
+TEXT = "I found the charger. Shall I go there now?"
 RATE = 450
 
 
@@ -40,11 +40,6 @@ def grow(engine: Engine, text: str, goal: str = "g1", *, interval_s: float = 0.0
 def shared() -> Iterator[SharedEngine]:
     with contextlib.closing(SharedEngine(Engine)) as shared:
         yield shared
-
-
-@pytest.fixture
-def engine(shared: SharedEngine, request: pytest.FixtureRequest) -> Engine:
-    return shared.take(request.session.testsfailed)
 
 
 def test_a_growing_text_is_heard_like_a_whole_one(sink: Sink) -> None:

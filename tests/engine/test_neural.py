@@ -27,7 +27,7 @@ from talkcli.install import NEURAL_PACKAGES
 from tests.engine.process import FAST, SOON, Engine, SharedEngine, before_call
 from tests.support import tiny_voice
 from tests.support.espeak import RATE
-from tests.support.real_voice import REAL_VOICE, real_voice
+from tests.support.real_voice import REAL_VOICE
 from tests.support.surroundings import needs_packages
 from tests.support.timing import assert_within, limits
 
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 TEXT = "battery low, please come home"
 VOICE = "piper/tiny"
 #: Code for the start of the process that makes loading slow, as on a slow machine.
-SLOW_TO_LOAD = before_call("synthesizers.inference:Model._set_halves", "time.sleep(0.4)")
+SLOW_TO_LOAD = before_call("synthesizers.inference:Model._set_halves", "time.sleep(0.3)")
 #: Code that makes all samples of a sentence late, except the first piece.
 SLOW_TO_SPEAK = before_call("synthesizers.inference:Model.decode", "time.sleep(1.4 if arguments[2] else 0)")
 #: Code that hides packages.
@@ -55,12 +55,6 @@ find_spec = importlib.util.find_spec
 importlib.util.find_spec = lambda name, *rest: None if name in {names} else find_spec(name, *rest)
 sys.meta_path.insert(0, Without())
 """
-#: Modules that an engine process doesn't need if no neural voice speaks.
-NEURAL_MODULES = [
-    *NEURAL_PACKAGES,
-    *("difflib", "hashlib", "queue"),
-    *(f"talkcli.engine.child.synthesizers.{name}" for name in ("inference", "loader", "phonemes", "piper", "vits")),
-]
 
 
 @pytest.fixture(scope="module")
@@ -192,18 +186,6 @@ def test_unknown_phonemes_are_left_out_and_a_text_without_others_fails(folder: P
 # -- without the extra
 
 
-def test_without_neural_speech_no_neural_module_is_imported(folder: Path) -> None:
-    report = f"""
-import atexit, sys
-atexit.register(lambda: sys.stderr.write(repr([name for name in {NEURAL_MODULES!r} if name in sys.modules])))
-"""
-    with _engine(folder, before=report) as engine:
-        assert VOICE in {voice.id for voice in engine.until(protocol.VoiceList).voices}
-        assert engine.spoken("yes").outcome == protocol.OUTCOME_COMPLETED
-        engine.leave()
-        assert engine.errors() == "[]"
-
-
 @pytest.mark.parametrize("package", NEURAL_PACKAGES)
 def test_the_error_without_the_extra_contains_the_install_command(tmp_path: Path, package: str) -> None:
     tiny_voice.put(tmp_path / "voices", "tiny")
@@ -323,30 +305,6 @@ def _little_memory(engine: Engine, limit: int) -> Iterator[None]:
         resource.prlimit(engine.process.pid, resource.RLIMIT_AS, before)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("megabytes", range(80, 480, 40))
-def test_a_sentence_ends_once_with_little_memory_and_espeak_speaks_next(tmp_path: Path, megabytes: int) -> None:
-    """The process may die, because numpy's libraries exit if they get no memory while they are loaded.
-
-    Or an import fails halfway, with an error about any missing name.
-    """
-    real_voice()
-    limit = f"import resource\nresource.setrlimit(resource.RLIMIT_AS, ({megabytes} << 20, -1))"
-    with _engine(tmp_path / "voices", f"file:{tmp_path / 'out.wav'}", before=limit) as engine:
-        engine.say("word " * 100, "g1", voice=REAL_VOICE)
-        try:
-            ended = engine.until(protocol.Ended)
-        except AssertionError:
-            engine.process.wait(20)
-            return
-        if ended.outcome == protocol.OUTCOME_COMPLETED:
-            assert megabytes > 300, "the voice spoke with too little memory"
-        else:
-            message = _failure_message(ended)
-            assert "there is not enough memory; end another program" in message or install.neural_command() in message
-        assert engine.spoken(TEXT, "g2").outcome == protocol.OUTCOME_COMPLETED
-
-
 # -- stop and pause
 
 
@@ -370,21 +328,22 @@ def test_a_sentence_can_be_paused_and_stopped_while_its_voice_loads(folder: Path
 
 
 @limits()
-@pytest.mark.parametrize("method", ["clauses", "word_positions", "ends_with_abbreviation"])
-def test_a_sentence_can_be_paused_and_stopped_during_phonemization(folder: Path, method: str) -> None:
+def test_a_sentence_can_be_paused_and_stopped_during_phonemization(folder: Path) -> None:
     """libespeak-ng needs 0.1 s without interruption for a clause of 800 bytes in a script that the voice can't read."""
     text = "Go. Dr. Who. " + "电池电量低正在返回充电站" * 800
-    report = f"arguments[0] in seen or seen.append(arguments[0]) or print({method!r}, file=sys.stderr, flush=True)"
-    with _engine(folder, before=before_call(f"synthesizers.espeak:EspeakPhonemizer.{method}", report)) as engine:
-        assert engine.spoken("Go. Go", "g0", voice=VOICE).outcome == protocol.OUTCOME_COMPLETED
-        assert engine.errors_line() == method
-        for number in (1, 2):
-            goal = f"g{number}"
+    methods = ("clauses", "word_positions", "ends_with_abbreviation")
+    report = "arguments[0] in seen or seen.append(arguments[0]) or print({!r}, len(seen), file=sys.stderr, flush=True)"
+    before = (before_call(f"synthesizers.espeak:EspeakPhonemizer.{name}", report.format(name)) for name in methods)
+    with _engine(folder, before="\n".join(before)) as engine:
+        for method in methods:
+            goal = f"g {method}"
             engine.say(text, goal, voice=VOICE)
-            assert engine.errors_line() == method
-            if number % 2:
+            while not engine.errors_line().startswith(method):
+                pass
+            if method == "clauses":
                 assert_within(engine.pause(goal), 0.1, "a pause during phonemization")
             assert_within(engine.stop(goal), 0.05, "a stop during phonemization")
+            engine.errors_so_far()
         assert engine.spoken("espeak", "g20").outcome == protocol.OUTCOME_COMPLETED
 
 
@@ -450,21 +409,19 @@ def test_gaps_are_counted_and_words_are_reported_when_heard(
         assert heard[0] - 0.1 < reported_at < heard[-1] + 0.1
 
 
-@pytest.mark.parametrize("player", [pytest.param("null", marks=pytest.mark.slow), "pulse"])
-def test_a_process_that_is_slowed_speaks_with_gaps(real_voice_env: dict[str, str], sink: Sink, player: str) -> None:
+def test_a_process_that_is_slowed_speaks_with_gaps(folder: Path, sink: Sink) -> None:
     """The process and its built-in player are stopped for 0.16 s again and again, as under a CPU limit."""
-    text = "Please step aside."
-    with Engine(player, environment={**real_voice_env, **sink.env}) as engine:
-        assert engine.spoken("a", "g0", voice=REAL_VOICE).gaps == 0
+    with _engine(folder, "pulse", sink.env) as engine:
+        assert engine.spoken("a", "g0", voice=VOICE).gaps == 0
         with _slowed(engine, running=0.04, stopped=0.16):
             started_at = time.monotonic()
-            ended = engine.spoken(text, voice=REAL_VOICE, rate=200)
+            ended = engine.spoken("one two", voice=VOICE)
             took = time.monotonic() - started_at
         assert ended.outcome == protocol.OUTCOME_COMPLETED
         assert ended.duration is not None
-        assert _words(engine, text) == text.rstrip(".").split()
+        assert _words(engine, "one two") == ["one", "two"]
         assert ended.gaps > 2
-        assert 0.5 < ended.gap_seconds < took - ended.duration + engine.words()[0].time
+        assert 0.2 < ended.gap_seconds < took - ended.duration + engine.words()[0].time
         assert engine.spoken("espeak", "g2").outcome == protocol.OUTCOME_COMPLETED
 
 

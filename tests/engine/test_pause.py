@@ -54,7 +54,7 @@ def _resume_to_the_end(engine: Engine) -> protocol.Ended:
 @limits()
 @pytest.mark.parametrize("program", [False, True])
 def test_a_pause_delays_words_while_signs_of_life_continue(player: Player, program: bool) -> None:
-    alive_every = 0.2
+    alive_every = 0.15
     command = player.plays() if program else "null"
     with Engine(command, limits={"RELEASE_DELAY_S": 10.0 if program else 0.3}, alive_every=alive_every) as engine:
         engine.until(protocol.VoiceList)
@@ -112,7 +112,7 @@ def test_a_resume_before_silence_loses_no_sample(player: Player) -> None:
 
 @pytest.mark.parametrize("dies", [False, True])
 def test_a_paused_player_gets_silence_and_is_replaced_if_it_dies(player: Player, dies: bool) -> None:
-    alive_every = 0.3
+    alive_every = 0.15
     with Engine(player.plays(), alive_every=alive_every) as engine:
         _say_until_word(engine)
         engine.pause()

@@ -249,16 +249,6 @@ def test_sentences_are_appended_and_remains_of_a_crash_are_cut_off(tmp_path: Pat
     assert path.stat().st_size == 44 + 8
 
 
-def test_a_killed_sentence_leaves_a_valid_file(tmp_path: Path) -> None:
-    path = tmp_path / "x.wav"
-    file = WavPlayer(str(path), 22050)
-    file.offer(memoryview(b"one "))
-    file.kill()
-    file.kill()
-    assert file.gone()
-    assert _read(path) == b"one "
-
-
 def _stereo(path: Path) -> None:
     with wave.open(str(path), "wb") as file:
         file.setnchannels(2)

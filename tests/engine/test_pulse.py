@@ -151,7 +151,7 @@ def before_each_call(monkeypatch: pytest.MonkeyPatch, action: Callable[[], None]
         yield
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_no_wakeup_is_lost_whatever_the_timing(make_rig: MakeRig, monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
     chance = random.Random(seed)
     with make_rig() as rig:
@@ -171,12 +171,11 @@ def test_no_wakeup_is_lost_whatever_the_timing(make_rig: MakeRig, monkeypatch: p
     assert SECONDS <= took < SECONDS + 1
 
 
-@pytest.mark.parametrize("number", ERRORS)
-def test_a_server_error_at_any_step_ends_playback_with_a_reason(make_rig: MakeRig, number: int) -> None:
+def test_a_server_error_at_any_step_ends_playback_with_a_reason(make_rig: MakeRig) -> None:
     errors = []
     for step in range(8):
         with make_rig() as rig:
-            rig.relay.error = (step, number)
+            rig.relay.error = (step, ERRORS[step % 2])
             errors.append(rig.try_to_play())
     # the first steps are the authentication, the client's name and the stream; errors of later ones may be ignored
     assert None not in errors[:3], errors
@@ -188,7 +187,7 @@ def test_a_connection_lost_at_any_byte_ends_playback_with_a_reason(make_rig: Mak
     with make_rig() as rig:
         assert rig.try_to_play() is None
         whole = rig.relay.forwarded
-    for at in range(0, whole // 2, 127):  # the number of time reports varies, but half the bytes are never enough
+    for at in range(0, whole // 2, 191):  # the number of time reports varies, but half the bytes are never enough
         with make_rig() as rig:
             if hush:
                 rig.relay.silent_at = at
@@ -268,7 +267,7 @@ def test_a_time_reported_before_playback_starts_is_ignored() -> None:
             patch.setenv(name, value)
         server.load("card")
         rig = Rig()
-        for _ in range(5):
+        for _ in range(3):
             player = PulsePlayer(RATE)
             try:
                 while player.device is None:

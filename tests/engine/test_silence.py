@@ -23,9 +23,9 @@ from tests.support.timing import assert_within, limits
 if TYPE_CHECKING:
     from pathlib import Path
 
-TEXT, SECOND = "battery low", "thank you"
+TEXT = "battery low"
 #: Lengths of two lead-ins in milliseconds.
-LEAD_IN, OWN = 300, 200
+LEAD_IN, OWN = 200, 150
 
 
 def _silence(milliseconds: int) -> bytes:
@@ -44,17 +44,16 @@ def _idle_after(seconds: float) -> str:
     ("server_lead_in", "idle_after", "own", "expected"),
     [
         (LEAD_IN, 10.0, [None, None], [LEAD_IN, 0]),
-        (LEAD_IN, 0.0, [None, None], [LEAD_IN, LEAD_IN]),
         (0, 10.0, [OWN, OWN, None], [OWN, OWN, 0]),
         (LEAD_IN, 0.0, [0, OWN, None], [0, OWN, LEAD_IN]),
     ],
-    ids=["the first sentence", "idle again", "the sentence's own", "instead of the server's"],
+    ids=["the first sentence", "the sentence's own", "instead of the server's"],
 )
 @limits()
 def test_a_lead_in_delays_the_words_and_is_not_part_of_the_duration(
     player: Player, server_lead_in: int, idle_after: float, own: list[int | None], expected: list[int]
 ) -> None:
-    texts = [TEXT, SECOND, SECOND][: len(own)]
+    texts = ["low", "yes", "yes"][: len(own)]
     sentences = [without_leading_zeros(samples).astype("<i2").tobytes() for samples in render(texts, rate=FAST)]
     with Engine(player.plays(), lead_in=server_lead_in, before=_idle_after(idle_after)) as engine:
         for number, (text, lead_in, sentence) in enumerate(zip(texts, own, sentences, strict=True)):
@@ -266,15 +265,13 @@ def test_trailing_silence_reaches_back_to_the_last_loud_sample() -> None:
 
 def test_a_sentence_before_a_waiting_goal_is_shortened_only_by_silence(player: Player) -> None:
     """The next sentence is played completely. Each `Ended` has the duration that was played."""
-    first, second, third = _all_played()
+    first, second, _ = _all_played()
     with Engine(player.plays(), before=_CUTS_SOME) as engine:
-        ended = []
-        for number, text in enumerate(TEXTS):
-            ended.append(engine.spoken(text, f"g{number}", next_waits=number < 2))
-    expected = [first[:-CUT_BYTES], second[:-CUT_BYTES], third]
-    assert [event.outcome for event in ended] == [protocol.OUTCOME_COMPLETED] * 3
+        ended = [engine.spoken(text, text, next_waits=text == TEXTS[0]) for text in TEXTS[:2]]
+    expected = [first[:-CUT_BYTES], second]
+    assert [event.outcome for event in ended] == [protocol.OUTCOME_COMPLETED] * 2
     assert player.heard.read_bytes() == b"".join(expected)
-    assert not any(first[-CUT_BYTES:] + second[-CUT_BYTES:])
+    assert not any(first[-CUT_BYTES:])
     assert [event.duration for event in ended] == [pytest.approx(len(part) / 2 / RATE, abs=1e-4) for part in expected]
 
 

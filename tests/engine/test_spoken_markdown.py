@@ -12,7 +12,6 @@ from talkcli.engine import protocol
 from talkcli.engine.parent.render import render
 from talkcli.goals.reasons import Reason
 from tests.engine.process import FAST, Engine, SharedEngine
-from tests.support.real_voice import REAL_VOICE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -71,12 +70,6 @@ def test_an_incomplete_link_of_a_broken_text_is_not_spoken(engine: Engine) -> No
     text = ["**One.** Two. ", "See [the docs](http"]
     assert speak(engine, *text, last=False).outcome == protocol.OUTCOME_COMPLETED
     assert heard(engine, "".join(text)) == ["One", "Two"]
-
-
-def test_a_neural_voice_does_not_speak_marks(real_voice_env: dict[str, str], tmp_path: Path) -> None:
-    with Engine(f"file:{tmp_path / 'out.wav'}", environment=real_voice_env) as engine:
-        speak(engine, TEXT, voice=REAL_VOICE)
-        assert heard(engine, TEXT) == WORDS
 
 
 def test_a_file_has_the_samples_of_the_text_without_marks(tmp_path: Path) -> None:

@@ -73,14 +73,14 @@ def _process(thread: EngineThread) -> EngineProcess:
 
 
 def test_a_pause_may_exceed_all_limits_and_resumes_in_place(start: StartThread) -> None:
-    thread = start(HANG_LIMIT_S=0.7, HOLD_LIMIT_S=0.7)
+    thread = start(HANG_LIMIT_S=0.5, HOLD_LIMIT_S=0.5)
     started_at = time.monotonic()
     _pause(thread, "length=0.4 slow-pause=0.1 two three four")
     assert thread.until(protocol.Held).id == "g1"
-    assert thread.next(1.0) is None
+    assert thread.next(0.7) is None
     thread.engine.resume("g1")
     assert thread.until(protocol.Ended).outcome == OUTCOME_COMPLETED
-    assert time.monotonic() - started_at >= 0.4 + 1.0
+    assert time.monotonic() - started_at >= 0.4 + 0.7
     assert [report.number for report in thread.seen if isinstance(report, protocol.Word)] == [1, 2, 3, 4, 5]
 
 
@@ -127,19 +127,19 @@ def test_a_late_confirmation_does_not_count_for_a_new_pause(start: StartThread) 
 
 
 def test_a_goal_waiting_for_a_process_is_paused_by_the_thread(start: StartThread) -> None:
-    thread = start("slow=0.4")
+    thread = start("slow=0.3")
     thread.say("two words")
     thread.engine.pause("g1", 1)
     assert thread.next() == protocol.Held("g1", 1)
     thread.until(protocol.VoiceList)
-    assert thread.next(0.4) is None
+    assert thread.next(0.2) is None
     thread.engine.resume("g1")
     assert isinstance(thread.next(), protocol.Word)
     assert thread.until(protocol.Ended).outcome == OUTCOME_COMPLETED
 
 
 def test_a_goal_paused_by_the_thread_is_stopped_at_once(start: StartThread) -> None:
-    thread = start("slow=0.5")
+    thread = start("slow=0.3")
     thread.say("two words")
     thread.engine.pause("g1", 1)
     thread.engine.stop("g1")
@@ -223,7 +223,7 @@ def test_a_process_that_reads_late_gets_all_of_a_growing_text(start_python: Call
 def test_a_goal_sent_to_a_dying_process_is_spoken_by_the_next(start: StartThread) -> None:
     thread = start()
     thread.until(protocol.Ready)
-    for number in range(10):
+    for number in range(5):
         process = thread.engine._process
         assert process is not None
         os.kill(process.pid, signal.SIGKILL)
@@ -255,7 +255,7 @@ def test_an_interrupted_goal_ends_once_and_can_be_continued(start: StartThread) 
 
 
 def test_a_goal_that_no_process_has_started_is_interrupted_before_its_first_word(start: StartThread) -> None:
-    thread = start("slow")
+    thread = start("slow=0.3")
     thread.say("yes")
     thread.engine.interrupt("g1")
     assert thread.until(protocol.Ended) == _interrupted(rest=0)
@@ -326,7 +326,7 @@ def test_a_goal_submitted_just_before_the_shutdown_ends(start: StartThread, monk
 
 def test_after_a_suspend_messages_come_before_time_limits(start: StartThread, monkeypatch: pytest.MonkeyPatch) -> None:
     """After the machine or the server was suspended, messages are read before time limits are checked."""
-    suspensions = [0.7]
+    suspensions = [0.5]
 
     class Clock:
         def __getattr__(self, name: str) -> Any:
@@ -338,9 +338,9 @@ def test_after_a_suspend_messages_come_before_time_limits(start: StartThread, mo
             return time.monotonic()
 
     words: list[protocol.Word] = []
-    thread = start(HANG_LIMIT_S=0.5)
+    thread = start(HANG_LIMIT_S=0.4)
     monkeypatch.setattr(supervisor, "time", Clock())
-    thread.say("length=1.1 b c d e f g h i j k")
+    thread.say("length=0.8 b c d e f g h i j k")
     words.append(thread.until(protocol.Word))
     assert thread.until(protocol.Ended).outcome == OUTCOME_COMPLETED
     assert not suspensions
@@ -352,11 +352,11 @@ def test_a_hanging_start_is_retried_and_later_fails_one_goal_each_time(
     script = tmp_path / "start"
     script.write_text("hang")
     monkeypatch.setenv("SCRIPTED_START_FILE", str(script))
-    thread = start(START_LIMIT_S=0.3, ENGINE_WAIT_LIMIT_S=0.5, RESTART_DELAYS_S=(0.0,))
+    thread = start(START_LIMIT_S=0.2, ENGINE_WAIT_LIMIT_S=0.35, RESTART_DELAYS_S=(0.0,))
     started_at = time.monotonic()
-    message = "the engine was not ready within 0.3 s"
+    message = "the engine was not ready within 0.2 s"
     assert thread.spoken("battery low") == protocol.Ended("g1", OUTCOME_FAILED, Reason.ENGINE_FAILED, message)
-    assert time.monotonic() - started_at >= 3 * 0.3, "the goal failed before ENGINE_WAIT_LIMIT_S"
+    assert time.monotonic() - started_at >= 2 * 0.2, "the goal failed before ENGINE_WAIT_LIMIT_S"
     assert thread.until(EngineMissing) == EngineMissing(message)  # the thread has no goal that it could fail
     thread.say("coming home", "g2")
     script.write_text("")

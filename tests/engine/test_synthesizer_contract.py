@@ -1,7 +1,6 @@
 """Tests that every synthesizer behaves as `synthesizers.base.Synthesizer` describes.
 
-To test a new synthesizer, add it to `SYNTHESIZERS`. The scripted one does only the minimum, which shows that the tests
-don't ask for more than the contract does.
+To test a new synthesizer, add it to `SYNTHESIZERS`.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from talkcli.engine.child.synthesizers.espeak import Espeak
 from talkcli.engine.child.synthesizers.phonemes import split_text
 from talkcli.engine.child.synthesizers.piper import Piper
 from talkcli.engine.players import SAMPLE_BYTES
-from talkcli.engine.protocol import Voice
 from talkcli.engine.voices import UnknownVoice
 from talkcli.goals.reasons import Reason
 from talkcli.install import NEURAL_PACKAGES
@@ -36,7 +34,7 @@ from tests.support.timing import assert_within, limits
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from talkcli.engine.child.synthesizers.base import SampleSink, Synthesizer
+    from talkcli.engine.child.synthesizers.base import Synthesizer
 
 TEXT = "battery low, please come home"
 #: Various texts.
@@ -61,39 +59,6 @@ LOADED = 0.5
 LATE = 20.0
 #: The most seconds of sound in one call of `write`, so that speech starts while the rest is still being made.
 MAX_WRITE_S = 0.2
-
-
-class Scripted:
-    """The simplest possible synthesizer. It makes a tone for each letter."""
-
-    version: str | None = None
-    _RATE = 16000
-
-    def __init__(self) -> None:
-        self.voice = "one"
-
-    def voices(self) -> tuple[Voice, ...]:
-        return (Voice("one", "en", "One"), Voice("two", None, "Two"))
-
-    def choose_voice(self, voice: str) -> None:
-        if voice not in {known.id for known in self.voices()}:
-            raise UnknownVoice("unknown voice")
-        self.voice = voice
-
-    def speak(self, text: str, sound: SpeechSettings, output: SampleSink) -> None:
-        output.begin(self._RATE, self.voice)
-        end = samples = 0
-        for word in text.split():
-            start = text.index(word, end)
-            end = start + len(word)
-            if not any(map(str.isalnum, word)):
-                continue
-            output.word(start, len(word), samples / self._RATE)
-            loud, period = int(9000 * sound.volume), (150 if self.voice == "one" else 90) - sound.pitch
-            for _ in word:
-                tone = [loud if index % period < period / 2 else -loud for index in range(800 * 200 // sound.rate)]
-                output.write(array("h", tone).tobytes())
-                samples += len(tone)
 
 
 @cache
@@ -123,7 +88,6 @@ def _combined() -> Synthesizer:
 
 SYNTHESIZERS: dict[str, Callable[[], Synthesizer]] = {
     "espeak": _espeak,
-    "scripted": Scripted,
     "piper": _piper,
     "joe": _joe,
     "combined": _combined,

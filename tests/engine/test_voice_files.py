@@ -16,6 +16,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import platformdirs
 import pytest
 
 from talkcli.engine import models
@@ -25,8 +26,6 @@ from talkcli.engine.models import VoiceFileError, find_models, installed_voices,
 from talkcli.engine.protocol import Voice
 from talkcli.paths import cache_directory, voice_directories
 from tests.support import tiny_voice
-
-SYS_PATH = list(sys.path)
 
 
 def json_path(path: Path) -> Path:
@@ -46,14 +45,6 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-#: A program that prints the directories of platformdirs for data and caches.
-_PLATFORMDIRS = """
-import json, platformdirs
-dirs = platformdirs.PlatformDirs("talk", appauthor=False, multipath=True)
-print(json.dumps([[dirs.user_data_dir, *dirs.site_data_dir.split(":")], dirs.user_cache_dir]))
-"""
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="neural voices need Linux")
 @pytest.mark.parametrize(
     "variables", [{}, {"XDG_DATA_HOME": "/d", "XDG_CACHE_HOME": "/c", "XDG_DATA_DIRS": "/a:/b"}, {"XDG_DATA_HOME": ""}]
@@ -64,11 +55,10 @@ def test_the_directories_are_those_of_platformdirs(monkeypatch: pytest.MonkeyPat
         monkeypatch.delenv(name)
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    code = f"import sys; sys.path[:] = {[*SYS_PATH]!r}\n{_PLATFORMDIRS}"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
-    data, cache = json.loads(done.stdout)
+    dirs = platformdirs.PlatformDirs("talk", appauthor=False, multipath=True)
+    data = [dirs.user_data_dir, *dirs.site_data_dir.split(":")]
     assert voice_directories() == [f"{directory}/voices" for directory in data]
-    assert cache_directory() == cache
+    assert cache_directory() == dirs.user_cache_dir
 
 
 def test_a_voice_is_taken_from_the_first_directory_that_has_it(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
