@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 #: Maximum length of a command line. This is enough for an interpreter, a script and its first arguments.
 _MAX_COMMAND_LINE_CHARS = 200
 
-#: Programs that run another program and wait for it. Their parent shows more clearly where a request comes from.
+#: Programs that run another program and wait for it. The parent of such a program shows more clearly where a request
+#: comes from.
 _WRAPPER_PROGRAMS = frozenset({b"timeout", b"time", b"flock", b"xargs", b"sudo"})
 #: Maximum number of a process's ancestors to examine. A shell that was started by a script is three levels below cron.
 _MAX_ANCESTORS_COUNT = 8

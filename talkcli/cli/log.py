@@ -83,7 +83,7 @@ def _read_history(options: CommonOptions, request: Log, error: ServerUnavailable
         from talkcli.history.rows import given_filters, row_to_json, sql_condition
 
         rows = search(path, *sql_condition(given_filters(request)), request.count, time.monotonic() + _SEARCH_LIMIT_S)
-    except (ImportError, TalkError) as failure:  # ImportError if this Python has no sqlite3
+    except (ImportError, TalkError) as failure:  # ImportError means that this Python has no sqlite3
         raise ServerUnavailable(f"{error.message}\nthe history {path} can't be read: {failure}") from failure
     if not options.quiet:
         note(f"no server is running, so these goals come from the history {path}")

@@ -257,7 +257,7 @@ class InputSpeaker:
         except Interrupted:
             if watched.pop(0, None) is None:
                 raise
-            wait_ready({}, 0, watched)  # raises Interrupted if there is also a signal or closed output
+            wait_ready({}, 0, watched)  # raises Interrupted after a signal, or if output is closed
             return _read_available()
         finally:
             watched.pop(0, None)

@@ -70,7 +70,7 @@ def write(message: str) -> None:
     data = f"talk: {message}\n".encode(errors="backslashreplace")
     if len(data) > _MAX_LOG_LINE_BYTES:
         data = data[: _MAX_LOG_LINE_BYTES - 1] + b"\n"
-    with contextlib.suppress(OSError, ValueError):  # ValueError if standard error is closed
+    with contextlib.suppress(OSError, ValueError):  # ValueError means that standard error is closed
         fd = sys.stderr.fileno() if sys.stderr else 2
         if wait_ready({fd: select.POLLOUT}, 0):
             os.write(fd, data)

@@ -126,7 +126,7 @@ def _parse_notify_address(value: str) -> str:
     Return "" if it is unset or invalid.
     """
     if value.startswith("@"):
-        return "\0" + value[1:]  # in Linux, @ stands for an abstract socket
+        return "\0" + value[1:]  # on Linux, @ marks an abstract socket
     return value if os.path.isabs(value) else ""
 
 

@@ -46,7 +46,7 @@ _Result = TypeVar("_Result")
 _STEP_LIMIT_S = 2 * LOGIN_LIMIT_S
 #: How long to wait for test messages and presence messages after the broker has acknowledged everything.
 _RETURN_LIMIT_S = 1.0
-#: Payload of the doctor's test message. Bridges use another payload for theirs.
+#: Payload of the doctor's test message. The echoes of bridges have a different payload.
 _ECHO_PAYLOAD = b"doctor"
 #: A warning is shown if the certificate expires within this time.
 _RENEWAL_LIMIT_S = 14 * 86400

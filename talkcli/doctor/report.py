@@ -14,7 +14,8 @@ from talkcli.terminal.text import COLUMN_GAP, Screen, pad, printable
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-#: The states of a finding. A warning means that speech may be inaudible, and a failure that it certainly is.
+#: The states of a finding. A warning means that speech may be inaudible. A failure means that speech is certainly
+#: inaudible.
 OK, WARNING, FAILURE = "ok", "warning", "failed"
 #: Number of names that are shown if a list is shortened.
 _SHOWN_NAMES_COUNT = 4

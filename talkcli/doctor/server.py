@@ -34,14 +34,14 @@ if TYPE_CHECKING:
 
 #: The name under which the doctor connects to the server.
 DOCTOR_NAME = "talk doctor"
-#: How a client's error message begins if no server was found.
+#: The beginning of a client's error message if no server was found.
 _NO_SERVER_PREFIX = "no server"
 #: Number of recently ended goals to check for failures.
 _LOG_GOALS_COUNT = 100
 _RECENT_CHECK = "recent goals"
 #: How long to wait for a starting engine, and how often to ask for its state.
 _ENGINE_START_LIMIT_S, _ENGINE_POLL_S = 1.0, 0.05
-#: Descriptions of paths that accept connections. The kernel accepts them even if the process never answers.
+#: Descriptions of paths that accept connections. The kernel accepts connections even if the process never answers.
 PLACE_FOREIGN = "another user's server"
 PLACE_LISTENING = "a process is listening"
 PLACE_STOPPED = "a stopped process is listening"

@@ -84,7 +84,7 @@ class SpeechTimes:
     """The start times of the last goals that were spoken, by key and by text."""
 
     def __init__(self) -> None:
-        #: start time and id of the last goal with each key, and of the last goal with each text, by the text's hash
+        #: start time and id of the last goal, by its key and by the hash of its text
         self._starts: OrderedDict[str | bytes, tuple[float, str]] = OrderedDict()
 
     def add(self, record: Record) -> None:

@@ -26,12 +26,11 @@ MAX_ID_CHARS = 64
 MAX_IDS = 4096
 #: Maximum length of a client's name, which is shown on one line of a terminal.
 MAX_SENDER_NAME_CHARS = 64
-#: Maximum size of a goal's `data` as JSON. It is meant for labels, not for storage.
+#: Maximum size of a goal's `data` as JSON. The data is meant for labels, not for storage.
 MAX_DATA_BYTES = 1024
 #: Maximum number of goals in a reply to `log`. The server keeps the same number of ended goals in memory.
 MAX_LOG_GOALS = 2_200
-#: Names of the final states of a goal. They are repeated here because `State` is slow to import, and a test compares
-#: them.
+#: Names of the final states of a goal. They are repeated here, because `State` is slow to import.
 END_STATES = ("SUCCEEDED", "ABORTED", "REJECTED", "RECALLED", "PREEMPTED")
 #: Maximum length of a text, which is enough for several minutes of speech. A longer text should be split, so that other
 #: goals can be spoken in between.
@@ -43,8 +42,8 @@ MAX_TEXT_BYTES = 40_000
 GROWTH_FACTOR = 5
 #: How long a goal waits for more text after the text so far was spoken: the default, the minimum and the maximum.
 STALL_S, MIN_STALL_S, MAX_STALL_S = 5, 1, 60
-#: The time limit of a pause that ends with its connection: the default, the minimum and the maximum. It ends the pause
-#: of a program that hangs.
+#: The time limit of a pause that ends with its connection: the default, the minimum and the maximum. The limit ends the
+#: pause of a program that hangs.
 PAUSE_S, MIN_PAUSE_S, MAX_PAUSE_S = 600, 0.1, 86_400
 #: How long a pause may last before the doctor and the log warn about it.
 LONG_PAUSE_S = 600
@@ -118,7 +117,7 @@ def is_clients_id(goal_id: str) -> bool:
     boot, dash, number = goal_id.partition("-")
     if not dash:
         return not _DIGITS.issuperset(goal_id)
-    # Ids made by a server look like 4k7f-12. Clients can still choose names such as `goal-1` or `2024-12`.
+    # Ids that servers generate look like 4k7f-12. Clients can still choose names such as `goal-1` or `2024-12`.
     servers = len(boot) == 4 and _DIGITS.issuperset(boot[::2]) and _LETTERS.issuperset(boot[1::2])
     return not (servers and number and _DIGITS.issuperset(number))
 
@@ -603,7 +602,7 @@ SOUND_OPTIONS = tuple(each for each in OPTIONS if each.for_engine and each.setti
 SPEECH_OPTIONS = {"rate", "voice", "voice_only", "pitch", "more", "stall", "dry_run"}
 #: Names of the options that a goal's JSON includes.
 SHOWN_OPTIONS = tuple(each.name for each in OPTIONS if each.in_goal)
-#: Options that have a default on the server. Those sent to the engine come first.
+#: Options that have a default on the server. Options that are sent to the engine come first.
 SETTINGS = tuple(sorted((each for each in OPTIONS if each.setting), key=lambda each: not each.for_engine))
 _NONE_VALUES = {each.name: each.setting.none_value for each in SETTINGS if each.setting}
 

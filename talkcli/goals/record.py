@@ -39,7 +39,7 @@ class Record:
     preempt: bool = False
     #: monotonic time at which the goal expires if it hasn't started, or inf
     expires_at: float = inf
-    #: length of the text when the goal was sent; a growing text gets longer
+    #: length of the text when the goal was sent; a growing text becomes longer
     first_chars: int = 0
     #: hash of the original text, if the text was dropped to save memory
     text_hash: int | None = None
@@ -49,7 +49,7 @@ class Record:
     reason: Reason | None = None
     by: By | None = None
     message: str | None = None
-    #: terms of the text with their replacements, or None before the goal has started
+    #: replacements for terms in the text, or None before the goal has started
     pronunciations: dict[str, str] | None = None
     #: offset of the end of the last word that has started, or 0 if nothing was heard
     begun_end: int = 0

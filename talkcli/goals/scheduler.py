@@ -133,7 +133,7 @@ Effect = StateChange | Interruption | PauseChange | EngineOrder | VoiceLoadOrder
 class Cancellation:
     """The result of a cancel request: the goals found, the unknown ids, and the effects to carry out."""
 
-    #: pending and interrupted goals, which this cancel has ended at once
+    #: pending and interrupted goals that the request has ended at once
     ended_at_once: list[Record] = field(default_factory=list)
     #: the active goal, if it is being stopped
     stopping: Record | None = None
@@ -183,8 +183,7 @@ class Scheduler:
         self._interrupter: str | None = None
         #: whether speech is paused
         self.paused = False
-        #: the pauses that end with a connection, by connection. The key None is for the longest one of all other
-        #: pauses.
+        #: the pauses that end with their connections, by connection. The longest of all other pauses has the key None.
         self._pauses: dict[object, SpeechPause] = {}
         #: whether goals can start. This is also true if no engine can be started, so that goals fail at once.
         self.has_engine = False

@@ -58,7 +58,7 @@ DELETE FROM goals WHERE number <=
     (SELECT number FROM goals ORDER BY number LIMIT 1 OFFSET (SELECT count(*) / 20 FROM goals))
 """
 _INSERT = f"INSERT INTO goals ({', '.join(COLUMNS)}) VALUES ({', '.join('?' * len(COLUMNS))})"
-#: SQLite's messages if the content of a file is invalid. Python 3.10 has no error codes.
+#: SQLite's error messages for a file with invalid content. In Python 3.10, its exceptions have no error codes.
 _DAMAGED = ("malformed", "not a database")
 #: Number of steps of a search between two checks of its time limit. This many steps take about 1 ms.
 _STEPS_PER_CHECK = 100_000
@@ -130,7 +130,7 @@ class HistoryWriter:
         """Write goals, and delete old ones. If the file was removed, start a new one and return a message."""
         message = None
         if self._connection and _identity(self._path) != self._file:
-            self.close()  # before a new file is created, because closing removes the WAL
+            self.close()  # close the file before a new one is created, because closing removes the WAL
             message = f"{self._path} was removed or replaced, so a new history was started"
         connection = self._connection or self._open()
         wal = f"{self._path}-wal"

@@ -32,7 +32,7 @@ CREATE TABLE IF NOT EXISTS goals (
 CREATE INDEX IF NOT EXISTS goals_by_id ON goals (id);
 CREATE INDEX IF NOT EXISTS goals_by_end ON goals (ended_at);
 """
-#: The columns of the table, except the goal's position in the order in which goals ended.
+#: The columns of the table, except for the number that shows the order in which goals ended.
 COLUMNS = ("id", "ended_at", "state", "name", "key", "text", "other")
 #: The fields of a goal that have columns of their own, and the goal's field `spoken`.
 _SEPARATE_FIELDS = {"id", "ended_at", "state", "key", "text", "spoken"}

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from talkcli.goals.goal import JsonObject
 
 
-#: All features. Each has a name for error messages, and the field and the value of the requests that need it. The value
-#: None stands for any value. Never remove a feature.
+#: All features. Each entry has a name for error messages, and the field and the value of requests that need the
+#: feature. The value None stands for any value. Never remove a feature.
 FEATURES: dict[str, tuple[str, str, object]] = {
     "append": ("growing texts", "more", True),
     "dry_run": ("dry runs", "dry_run", True),

@@ -46,7 +46,7 @@ _FIELD_FORMATS = {
 _OPTIONAL_FIELDS = frozenset({"synthesizer", "device", "lead_in", "ttl", "preempt"})
 
 _UNKNOWN_SENDER = "unknown"
-#: Programs that run a script or another program, by name without version number. Each value consists of the options
+#: Programs that run a script or another program, by name without the version number. Each value consists of the options
 #: that take a value, the options that replace the script, and the number of arguments before the script.
 _LAUNCHERS = {
     **dict.fromkeys(("sh", "bash", "dash", "ash", "zsh", "ksh", "fish"), ("o O rcfile init-file", "c s", 0)),

@@ -319,7 +319,7 @@ class Bridge:
         """Stop watching the descriptor of the connection to the broker."""
         if self._descriptor >= 0:
             for forget in (self._loop.remove_reader, self._loop.remove_writer):
-                # If paho has already closed the socket, this raises an error after removing the descriptor.
+                # If paho has already closed the socket, this call removes the descriptor and then raises an error.
                 with contextlib.suppress(OSError):
                     forget(self._descriptor)
             self._descriptor = -1

@@ -53,7 +53,7 @@ _MAX_ID_PREFIX_CHARS = 48
 #: Message to a client after the server has closed the client's connection.
 _SERVER_GONE = "the robot's talk server closed the connection"
 _ALIVE = b'{"event": "alive"}\n'
-#: Lines that start with one of these are published with QoS 0, because losing them does no harm.
+#: Lines that start with one of these prefixes are published with QoS 0, because losing them does no harm.
 _UNRELIABLE = (b'{"event": "word"', b'{"event": "alive"')
 
 
