@@ -149,7 +149,7 @@ class Connection(ClientCore):
             self.changed.notify_all()
 
     async def open_another(self) -> Connection:
-        """Open and return another connection to the same server, which the server closes if the program dies.
+        """Open and return another connection to the same server. The server closes it if the program dies.
 
         Raises UsageError if there is no such connection, because a broker is in between.
         """

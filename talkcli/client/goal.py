@@ -259,7 +259,7 @@ class _EventStream:
         self.unfinished = list({each.id: each for each in handles}.values())
         #: the number of each goal's last event
         self._last_numbers: dict[str, int] = {}
-        #: the number of the last pause. Every goal receives it, but it is yielded only once.
+        #: the number of the last pause. Every goal receives the pause, but only the first event is yielded.
         self._last_pause = 0
 
     def take(self) -> list[tuple[GoalHandle, Event]]:

@@ -105,7 +105,7 @@ class StreamCalls:
             raise
 
     def _add_text(self, *_: object) -> None:
-        """Add the text that the server has accepted to the goal's handle."""
+        """Add the text accepted by the server to the goal's handle."""
         assert self.goal
         addition = self._text.accepted(self.goal.id)
         assert isinstance(addition, Append)

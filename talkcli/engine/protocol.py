@@ -273,7 +273,7 @@ class VoiceMemory:
     """
 
     voice: str  # ID of the voice that was loaded or used, without a speaker; empty after `DropVoice`
-    memory: int  # memory growth in bytes, measured from before the first neural voice was loaded
+    memory: int  # memory growth in bytes since before the first neural voice was loaded
 
 
 @frozen

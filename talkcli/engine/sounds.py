@@ -127,7 +127,8 @@ class SoundLibrary:
             if not target.startswith(os.path.join(os.path.realpath(directory), "")):
                 _refuse(path, f"is a link to a file outside of {directory}; copy the file into the directory")
             mode = os.lstat(target).st_mode
-            if not stat.S_ISREG(mode):  # opening a pipe waits for its writer, and opening a device may have an effect
+            # Opening a pipe would wait for its writer, and opening a device may have side effects.
+            if not stat.S_ISREG(mode):
                 _refuse(path, f"is {'a directory' if stat.S_ISDIR(mode) else 'not a regular file'}; use a WAV file")
             descriptor = os.open(target, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
             try:

@@ -68,9 +68,9 @@ class Handler(Protocol):
         """Start to carry out a client's request, which may be answered later."""
 
     def input_ended(self, connection: ClientConnection) -> None:
-        """End a client's pause and its incomplete texts at the end of its input.
+        """End a client's pause, and all its incomplete texts that no other connection may continue.
 
-        Others may continue some of the texts.
+        This method is called at the end of the client's input.
         """
 
     def is_waiting(self, connection: ClientConnection) -> bool:

@@ -82,7 +82,7 @@ class History:
         self._loop = asyncio.get_running_loop()
         self._writer = HistoryWriter(path)
         self._write_thread, self._search_thread = _Worker("history-write"), _Worker("history-search")
-        #: goals that are not known to be written, oldest first
+        #: goals that may not have been written yet, oldest first
         self._unwritten: deque[Goal] = deque()
         #: how many of the oldest unwritten goals are being written, or None if the thread is idle
         self._writing: int | None = None

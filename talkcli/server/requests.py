@@ -91,9 +91,9 @@ class Requests:
         self.input_ended(connection)
 
     def input_ended(self, connection: ClientConnection) -> None:
-        """End a client's pause and its incomplete texts at the end of its input.
+        """End a client's pause, and all its incomplete texts that no other connection may continue.
 
-        Others may continue some of the texts.
+        This method is called at the end of the client's input.
         """
         for record in [record for record, producer in self._producers.items() if producer is connection]:
             del self._producers[record]
@@ -145,7 +145,7 @@ class Requests:
         return self._speech.awaits_voices and (names_voice or isinstance(request, Voices))
 
     def _stop_awaiting_voices(self, connection: ClientConnection) -> None:
-        """Let a connection's requests continue without the list of voices for which they wait."""
+        """Continue a connection's requests that wait for the list of voices, without waiting any longer."""
         for each in self._awaiting_voices(connection):
             each.resume()
 

@@ -242,7 +242,7 @@ class Speech:
                 self.engine.resume(record.id)
 
     def _start_speaking(self, record: Record) -> None:
-        """Tell the engine to speak a goal or its rest. If the goal's voice is unavailable, fail the goal.
+        """Tell the engine to speak a goal or the rest of it. If the goal's voice is unavailable, fail the goal.
 
         The rest has the same voice and settings.
         """
@@ -281,7 +281,7 @@ class Speech:
         return self.pronunciation_file.refresh().terms if self.pronunciation_file else {}
 
     def describe_goal(self, record: Record) -> Goal:
-        """Return a copy of a goal. The copy also has the text as it is spoken, or would be spoken now."""
+        """Return a copy of a goal with the text as it is spoken, or as it would be spoken now."""
         goal, terms = record.snapshot(), record.pronunciations
         if terms is None and goal.state is State.PENDING:
             terms = self._current_pronunciations()

@@ -171,7 +171,7 @@ class PlayerFeed:
         self._clock = clock
         #: time at which the stream began. Each wait for missing text moves this time forward by the length of the wait.
         self.began_at = 0.0
-        #: time at which everything written will have been heard
+        #: time at which all written samples will have been heard
         self._heard_at = 0.0
         #: bytes of silence to write before the first sample
         self.lead_in = int(lead_in * rate) * SAMPLE_BYTES if player.real_time else 0

@@ -106,7 +106,7 @@ class ActiveGoal:
         #: the text, if it may still grow
         self.growing_text = _make_growing_text(self.text, command) if command.more or command.broken else None
         self.text_missing = False
-        #: number of characters received, and how many of them the server knows to be received
+        #: number of characters received, and the last such number that was reported to the server
         self.length, self.reported_length = len(command.text), 0
         self.words = WordFinder(self.text, max(command.start, command.heard_end), command.heard_words)
         #: time at which the driver last received text

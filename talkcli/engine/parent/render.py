@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from typing import Any
 
-#: For these reasons, a failure exits with the code of a rejected goal. All other failures exit with the code of an
-#: aborted goal.
+#: A failure for one of these reasons exits with the code of a rejected goal. Any other failure exits with the code of
+#: an aborted goal.
 _REJECTED_REASONS = frozenset({Reason.INVALID_TEXT, Reason.UNKNOWN_VOICE, Reason.BAD_OPTION})
 #: Failures of the player. When a text is rendered, the player writes the file, so these failures mean that the file
 #: can't be written.

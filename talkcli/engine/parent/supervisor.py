@@ -346,7 +346,7 @@ class Supervisor:
         elif self._process is None and now >= self._restarts.next_start_at:
             self._start_process()
         for process in [process for process, deadline in self._dying.items() if now >= deadline]:
-            self._dying[process] = NEVER  # kill only once more; the process is still reaped when it exits
+            self._dying[process] = NEVER  # don't kill the process again; it is still reaped when it exits
             process.kill()  # the first kill may have left processes alive if no descriptor was free
             if self._goal and self._goal.lost_process is process:
                 message = f"the player could not be stopped within {KILL_LIMIT_S:g} s"

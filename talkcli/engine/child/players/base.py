@@ -146,9 +146,9 @@ class Player(Protocol):
         """
 
     def wake_at(self) -> float:
-        """Return when to call the player again, or NEVER if its descriptors report everything.
+        """Return the time at which to call the player again even if no descriptor is ready.
 
-        The result is a time of the monotonic clock.
+        The result is a time of the monotonic clock, or NEVER.
         """
 
     def kill(self) -> None:

@@ -165,7 +165,7 @@ class Espeak:
         espeak = self._espeak
         self._listed: tuple[Voice, ...] = ()
         #: the parameters last passed to the library. Setting a parameter can change the sound even if its value stays
-        #: the same, so only changed ones are passed.
+        #: the same, so only changed parameters are passed.
         self._parameters = {espeak.RATE: _ESPEAK_DEFAULT_WPM, espeak.VOLUME: 100, espeak.PITCH: 50}
         #: the last phonemizer, which may still be using the library, or None if it has been stopped
         self._phonemizer: EspeakPhonemizer | None = None
