@@ -66,4 +66,4 @@ def run_blocking(coroutine: Coroutine[Any, Any, _T]) -> _T:
         coroutine.send(None)
     except StopIteration as end:
         return end.value  # type: ignore[no-any-return]
-    raise AssertionError(f"{coroutine!r} has suspended")
+    raise AssertionError(f"{coroutine!r} was suspended before it returned")

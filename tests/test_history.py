@@ -337,4 +337,4 @@ def test_a_history_of_another_user_is_named_with_its_owner(
     first, *_, last = str(failed.value).splitlines()
     assert first == "no server found; tried:"
     owner = stat("/").st_uid if hidden else os.getuid()
-    assert last == f"the history {path} can't be read: it belongs to uid {owner}"
+    assert last == f"the history {path} can't be read: the file belongs to uid {owner}"

@@ -36,7 +36,7 @@ def test_pause_and_resume_report_the_affected_goal(scripted: Talk, active: str) 
     done = scripted.run("pause")
     assert (done.code, done.out) == (0, "")
     assert done.err.startswith(f'talk: goal {active} is paused after "never-ends')
-    assert done.err.endswith('"; continue with: talk resume\n')
+    assert done.err.endswith('"; to continue, run: talk resume\n')
     assert ("\x1b" in done.err, r"\x1b[31m\u202e" in done.err) == (False, True)
     assert scripted.goal(active)["paused"] is True
     again = scripted.run("pause")
@@ -59,7 +59,7 @@ def test_pause_and_resume_report_the_affected_goal(scripted: Talk, active: str) 
 def test_status_shows_the_paused_goal(scripted: Talk, active: str) -> None:
     scripted.run("pause")
     status = scripted.run("status").out
-    assert re.search(r"paused   speech is paused by \S+ since \S+; continue with: talk resume\n", status)
+    assert re.search(r"paused   speech is paused by \S+ since \S+; to continue, run: talk resume\n", status)
     assert f"now      {active.partition('-')[2]}  ACTIVE" in status
     assert ", paused, for " in status
     assert "state    ACTIVE, paused\n" in scripted.run("status", active).out
@@ -126,7 +126,7 @@ def paused_for(talk: Talk) -> float | None:
 def test_a_pause_ends_after_the_time_of_for(scripted: Talk) -> None:
     done = scripted.run("pause", "--for", "20m")
     assert (done.code, paused_for(scripted)) == (0, 1200)
-    assert re.fullmatch(r"talk: speech is paused until \d\d:\d\d:\d\d; continue with: talk resume\n", done.err)
+    assert re.fullmatch(r"talk: speech is paused until \d\d:\d\d:\d\d; to continue, run: talk resume\n", done.err)
     assert re.search(r"^paused   .* since \S+, until \S+;", scripted.run("status").out, re.MULTILINE)
     assert scripted.run("resume").code == 0
     assert scripted.run("pause", "--for", "100ms").code == 0

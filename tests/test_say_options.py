@@ -140,7 +140,7 @@ def test_ctrl_c_while_the_text_is_read_prints_a_newline(scripted: Talk) -> None:
 def test_say_reports_that_speech_is_paused(scripted: Talk) -> None:
     active = busy(scripted)
     assert scripted.run("pause").code == 0
-    note = r"talk: speech is paused by \S+ since \S+; continue with: talk resume\n"
+    note = r"talk: speech is paused by \S+ since \S+; to continue, run: talk resume\n"
     assert re.fullmatch(note, scripted.run("say", "length=0").err)
     assert scripted.run("say", "-q", "length=0").err == ""
     waiting = scripted.start("say", "-w", "length=0")

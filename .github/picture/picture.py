@@ -290,6 +290,6 @@ def _drawn(row: Row, top: float) -> str:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("file", nargs="?", type=Path, default=HERE / "talk.svg")
-    parser.add_argument("--fast", action="store_true", help="type without pauses, for the test")
+    parser.add_argument("--fast", action="store_true", help="type without pauses (the test uses this option)")
     given = parser.parse_args()
     given.file.write_text(picture(record(0.0 if given.fast else 1.0)), encoding="utf-8")

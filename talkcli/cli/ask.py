@@ -133,7 +133,7 @@ def pause(options: CommonOptions, seconds: float | None, while_connected: bool, 
     place = f' after "{printable(heard)}"' if heard else ""
     words = f"goal {printable(goal.id)} is paused{place}" if goal else "speech is paused"
     words += "" if until is None else f" until {clock_time(until)}"
-    _report_pause(options, goal, paused=True, message=f"{words}; continue with: talk resume")
+    _report_pause(options, goal, paused=True, message=f"{words}; to continue, run: talk resume")
     return None
 
 

@@ -78,7 +78,7 @@ def _read_history(options: CommonOptions, request: Log, error: ServerUnavailable
     path = max(found, key=lambda each: os.access(each, os.R_OK))
     try:
         if not os.access(path, os.R_OK):
-            raise AccessDenied(f"it belongs to uid {_find_owner(path)}")
+            raise AccessDenied(f"the file belongs to uid {_find_owner(path)}")
         from talkcli.history.file import search
         from talkcli.history.rows import given_filters, row_to_json, sql_condition
 

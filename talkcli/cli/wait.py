@@ -67,7 +67,7 @@ class GoalReporter:
         if goal.speech_paused and not (pause_known or goal.state.terminal):
             from talkcli.terminal.goals import describe_pause
 
-            self.feedback.note(f"{describe_pause(goal.pause)}; continue with: talk resume")
+            self.feedback.note(f"{describe_pause(goal.pause)}; to continue, run: talk resume")
 
     def follow(self, goals: Sequence[GoalHandle], timeout: float | None) -> None:
         """Show the events of goals until they have ended.

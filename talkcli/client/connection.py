@@ -153,7 +153,7 @@ class Connection(ClientCore):
 
         Raises UsageError if there is no such connection, because a broker is in between.
         """
-        raise UsageError("over a broker, paused() isn't possible; use pause(seconds=...) instead")
+        raise UsageError("paused() doesn't work over a broker; use pause(seconds=...) instead")
 
     async def request(self, request: Request, on_reply: OnReply | None = None) -> tuple[JsonObject, list[JsonObject]]:
         """Send a request, and wait for the answer. Return the reply and the list items that came with it.

@@ -227,7 +227,7 @@ def _require_safe_owner(path: str, status: os.stat_result) -> None:
     """Raise VoiceFileError unless a file belongs to root or this user."""
     if status.st_uid not in {0, os.geteuid()}:
         words = f"{path} belongs to another user (#{status.st_uid}), who could change the voice"
-        raise VoiceFileError(f"{words}; put it into a directory of your own")
+        raise VoiceFileError(f"{words}; move the file to a directory of your own")
 
 
 def _has_acl(path: str) -> bool:

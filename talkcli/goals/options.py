@@ -417,7 +417,7 @@ OPTIONS = (
         "interrupt the current goal at the end of a word, unless it has a higher priority. Afterwards, that goal "
         "continues with its next word",
         default=False,
-        help="Interrupt the current sentence at the end of a word. Afterwards, that sentence continues.",
+        help="Interrupt the current sentence at the end of a word. Afterwards, the interrupted sentence continues.",
     ),
     Option(
         "priority",
@@ -427,8 +427,8 @@ OPTIONS = (
         # The range is not in `limits`, because the help text would show it.
         check=_priority_error,
         form=f"{-MAX_PRIORITY:,} to {MAX_PRIORITY:,}",
-        help="Set the priority. Sentences with a higher priority are spoken first. This sentence never interrupts or "
-        "flushes them.",
+        help="Set the priority. Sentences with a higher priority are spoken first. "
+        "This sentence never interrupts or flushes them.",
         in_goal=True,
     ),
     Option(
@@ -464,7 +464,7 @@ OPTIONS = (
         "reject the goal if the same text is waiting, is being spoken, or started less than this many seconds ago. For "
         "a goal with a key, keys are compared instead of texts, and waiting goals are ignored",
         limits=(0, None),
-        help="Skip the sentence if it was spoken in the last TIME. With --key, sentences with this KEY count.",
+        help="Skip the sentence if it was spoken in the last TIME. With --key, compare keys instead of texts.",
     ),
     Option(
         "id",
@@ -520,7 +520,7 @@ OPTIONS = (
         "wait until the voice is loaded, and abort the goal (`voice_failed`) if the voice can't be used, instead of "
         "speaking with espeak",
         default=False,
-        help="Fail instead of speaking with another voice. Wait until the voice is loaded.",
+        help="Wait until the voice is loaded. If it can't be used, fail instead of using another voice.",
         for_engine=True,
     ),
     Option(
@@ -569,7 +569,7 @@ OPTIONS = (
         default=STALL_S,
         limits=(MIN_STALL_S, MAX_STALL_S),
         unit=" seconds",
-        help="With --stream, stop if no text arrives for TIME. The time starts after all earlier text was spoken.",
+        help="With --stream, stop if no text arrives for TIME. TIME begins when all earlier text has been spoken.",
     ),
     Option(
         "format",
@@ -581,7 +581,7 @@ OPTIONS = (
         form=f"`text`, `{MARKDOWN}` or `{SOUND}`",
         special_flags="--markdown",
         flag_value=MARKDOWN,
-        help="Read TEXT as Markdown. Marks, code blocks, link addresses and emoji are not spoken.",
+        help="Read TEXT as Markdown. Markup, code blocks, link addresses and emoji are not spoken.",
         for_engine=True,
         in_goal=True,
     ),
@@ -590,7 +590,7 @@ OPTIONS = (
         FLAG,
         "only check the goal. It is never spoken, and its id is empty. `said` shows how it would be said",
         default=False,
-        help="Print TEXT as it would be said, and don't speak it.",
+        help="Print how TEXT would be said, but don't speak it.",
     ),
 )
 
@@ -809,7 +809,9 @@ class Log:
         Option("state", _END_STATE, "goals with this end state", choices=END_STATES, help="Show goals in this state."),
         Option("name", SENDER_NAME, "goals sent under this name", special_flags="--as", help="Show goals from NAME."),
         Option("key", WORD, "goals with this key", help="Show goals with this key."),
-        Option("grep", TEXT, "goals whose text contains this", help="Show goals whose text contains TEXT (same case)."),
+        Option(
+            "grep", TEXT, "goals whose text contains this", help="Show goals whose text contains TEXT (case-sensitive)."
+        ),
         Option("history", FLAG, "also goals in the server's history; see *The history* below", default=False),
     )
     count: int = 20

@@ -385,10 +385,10 @@ class Scheduler:
             words = f"the text of goal {record.id} has {len(text):,} characters, so nothing can be added at {at:,}"
             raise RequestRefused(words, "text_missing")
         if not addition.text.startswith(known):
-            raise RequestRefused(f"goal {record.id} has another text at {at:,}", "text_conflict")
+            raise RequestRefused(f"goal {record.id} already has a different text at position {at:,}", "text_conflict")
         if not record.more:
             if added:
-                raise RequestRefused(f"the text of goal {record.id} has ended", "text_ended")
+                raise RequestRefused(f"the text of goal {record.id} is already complete", "text_ended")
             return []
         if refused := options.bad_characters(added, self.max_text * options.GROWTH_FACTOR, len(text)):
             raise RequestRefused(refused[1], refused[0])

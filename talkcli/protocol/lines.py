@@ -188,7 +188,7 @@ def _refuse_constant(name: str) -> object:
 def _parse_integer(digits: str) -> int:
     """Convert digits to an integer. Raise ValueError if there are too many digits."""
     if len(digits) > MAX_DIGITS:
-        raise ValueError(f"an integer has {len(digits):,} digits (at most {MAX_DIGITS})")
+        raise ValueError(f"an integer has {len(digits):,} digits, but at most {MAX_DIGITS} are allowed")
     return int(digits)
 
 

@@ -328,7 +328,7 @@ class Speech:
         self.advance_time()
         if pause := self.scheduler.last_pause:
             minutes, by = goal_options.LONG_PAUSE_S / 60, describe_sender(pause.client)
-            log.write(f"speech has been paused for {minutes:g} minutes, last by {by}; continue with: talk resume")
+            log.write(f"speech has been paused for {minutes:g} minutes, last by {by}; to continue, run: talk resume")
 
     def describe_pause(self) -> JsonObject:
         """Return the fields of a reply that say whether speech is paused, and by whom.

@@ -141,7 +141,7 @@ def status_lines(status: ServerStatus, screen: Screen, now: float) -> list[str]:
         lines += wrap(printable(f"{voice} {state}{f': {why}' if why else ''}").split(" "), _pad_label("voice"), screen)
     if server.get("paused"):
         words = screen.coloured(describe_pause(server, screen), State.PREEMPTING)
-        lines += wrap([f"{words};", "continue with: talk resume"], _pad_label("paused"), screen)
+        lines += wrap([f"{words};", "to continue, run: talk resume"], _pad_label("paused"), screen)
     active = [status.active] if status.active else []
     tables: list[tuple[str, Sequence[Goal], str]] = [("now", active, "silent")]
     if status.interrupted:

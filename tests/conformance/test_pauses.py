@@ -91,4 +91,4 @@ def test_the_log_tells_of_a_long_pause_and_of_its_end(make_talk: MakeTalk, tmp_p
     warning = "talk: speech has been paused for 0.001 minutes, last by uid "
     assert [line.partition(",")[0] for line in lines[::2]] == ["talk: paused by uid 0", "talk: resumed"]
     assert lines[1].startswith(warning), lines
-    assert lines[1].endswith("; continue with: talk resume")
+    assert lines[1].endswith("; to continue, run: talk resume")

@@ -209,7 +209,7 @@ def test_the_error_without_the_extra_contains_the_install_command(tmp_path: Path
 WRONG: dict[str, tuple[bytes, dict[str, Any], str]] = {
     "no json": (tiny_voice.model(), {}, "wrong.onnx.json does not exist; download it from the source of the model"),
     "truncated": (tiny_voice.model()[:-300], {}, "is truncated, or not an ONNX model; download the voice again"),
-    "silent": (tiny_voice.model(amplitude=0.0), {}, "produced no sound for a text; download the voice again"),
+    "silent": (tiny_voice.model(amplitude=0.0), {}, "produced only silence; download the voice again"),
     "unknown language": (
         tiny_voice.model(),
         {"voice": "tlh"},

@@ -312,7 +312,7 @@ def test_a_client_imports_no_slow_modules(statement: str, without: list[str]) ->
 def test_contributing_names_every_file_that_handles_an_option() -> None:
     """The document's example is the option --ttl."""
     text = (PACKAGE.parent / ".github" / "CONTRIBUTING.md").read_text("utf-8")
-    steps = text.partition("**An option of `say`**")[2].partition("\n\nThe row of an option is used by")[0]
+    steps = text.partition("**An option of `say`**")[2].partition("\n\nMany parts of `talk` read the row")[0]
     named = {module_name(PACKAGE / path) for path in re.findall(r"talkcli/([\w/]+\.py)", steps)}
     having = {module for module in sources() if re.search(r"\bttl\b", ast.unparse(sources()[module]))}
     # In a fleet, a ttl is also the expiry of a message. No other option is handled there.

@@ -212,11 +212,11 @@ class Policy:
             words = f"this robot's bridge does not allow {needed} requests; add {needed} to its --allow"
             raise BadRequest(words, "not_allowed")
         if isinstance(request, Pause) and request.while_connected:
-            raise BadRequest("over a broker, a pause can't end with the connection; use 'seconds'", "bad_option")
+            raise BadRequest("'while_connected' doesn't work over a broker; use 'seconds' instead", "bad_option")
         if isinstance(request, Say) and self._is_stale(token, now):
             limit = f"{STALE_AFTER_S:g} s"
             why = f"the sentence may be more than {limit} old, because the broker or a connection to it stalled"
-            raise BadRequest(f"{why}; send it again if it is still true", STALE_CODE)
+            raise BadRequest(f"{why}; send the sentence again if it is still true", STALE_CODE)
 
     def _is_stale(self, token: str | None, now: float) -> bool:
         """Return whether a message may be too old. If it has no token, judge by the newest echo.

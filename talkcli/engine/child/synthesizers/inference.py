@@ -300,7 +300,7 @@ class Model:
                 raise
             raise self._mismatch_error(str(error.__cause__ or error)) from error
         if not frames.count:
-            raise VoiceFileError(f"{self.path} makes no sound; download the voice again")
+            raise VoiceFileError(f"{self.path} produces no sound; download the voice again")
         return len(self.decode(frames, 0, frames.count, run)) // frames.count
 
     def _not_piper_error(self, why: str) -> VoiceFileError:

@@ -233,7 +233,7 @@ def _speak_parts(
                 silent.clear()
             words, begin, count = (), end, min(_MAX_DECODED_FRAMES, 2 * count)
         if loudest < _SPEECH_LEVEL:
-            raise VoiceFileError(f"{model.path} produced no sound for a text; download the voice again")
+            raise VoiceFileError(f"{model.path} produced only silence; download the voice again")
         if part.ends_sentence and quiet < pause:
             yield bytes((pause - quiet) * SAMPLE_BYTES), ()
     if unknown and first and settings.begins_text:  # otherwise, the voice can speak other parts
