@@ -127,7 +127,7 @@ def _make_click_argument(argument: Option) -> click.Argument:
 
 
 def _make_completer(completer_name: str) -> Callable[..., list[CompletionItem]] | None:
-    """Return a function with which click completes values, or None if the name is empty."""
+    """Return a function that click calls to complete values, or None if the name is empty."""
 
     def complete(context: click.Context, _: click.Parameter, incomplete: str) -> list[CompletionItem]:
         from talkcli.cli import completion

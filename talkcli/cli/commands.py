@@ -136,7 +136,7 @@ _PLAY_OPTIONS = tuple(_play_options())
 
 
 def _play_fault(values: Mapping[str, Any], typed: frozenset[str]) -> str | None:
-    """Return an error message if options of `play` can't be combined."""
+    """Return an error message if the options of `play` can't be combined."""
     if values["list"]:
         return "--list takes no NAME and no other options" if values["sound"] or typed - {"list"} else None
     if not values["sound"]:

@@ -256,7 +256,7 @@ def _request_status(options: CommonOptions) -> ServerStatus:
 
 
 def _offer_ids(goals: Iterable[Goal], server: JsonObject, incomplete: str) -> Offers:
-    """Return the ids of all given goals as completions. Add this server's short ids if digits were typed."""
+    """Return the ids of goals as completions, including this server's short ids if digits were typed."""
     own = f"{server.get('boot')}-" if incomplete.isascii() and incomplete.isdecimal() else ""
     return [(name, _goal_help(each)) for each in goals for name in dict.fromkeys((each.id.removeprefix(own), each.id))]
 
@@ -277,6 +277,6 @@ def _goal_help(goal: Goal) -> str:
 
 
 def _voice_help(voice: JsonObject, field: str) -> str:
-    """Return the help text for a voice: its name and language, except the given field."""
+    """Return the name and the language of a voice as a help text. Leave out the given field."""
     parts = [_shorten(str(voice.get(each) or "")) for each in ("name", "language") if each != field]
     return ", ".join(filter(None, parts)) or "voice"

@@ -216,7 +216,7 @@ class _OutcomePrinter:
         return EXIT_DIFFER if len(codes) > 1 else next(iter(codes), EXIT_OK)
 
     def _print_outcome(self, outcome: Outcome) -> None:
-        """Print an outcome: as JSON, as a list of settings, or as one line.
+        """Print an outcome as JSON, as a list of settings or as one line.
 
         With --quiet, leave out the line, except for `status`.
         """

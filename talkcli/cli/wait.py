@@ -47,7 +47,7 @@ class GoalReporter:
     """A reporter that prints the ids and events of a command's goals, and why they failed."""
 
     def __init__(self, options: CommonOptions, *, feedback: bool) -> None:
-        """Initialise the reporter. If `feedback` is true, it shows each event."""
+        """Initialise the reporter. If `feedback` is true, the reporter shows each event."""
         self._options = options
         self.feedback = Feedback()
         if feedback:
@@ -70,7 +70,7 @@ class GoalReporter:
             self.feedback.note(f"{describe_pause(goal.pause)}; to continue, run: talk resume")
 
     def follow(self, goals: Sequence[GoalHandle], timeout: float | None) -> None:
-        """Show the events of goals until they have ended.
+        """Show the events of goals until the goals have ended.
 
         Raise TimeoutError if they don't end in time.
 

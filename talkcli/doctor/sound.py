@@ -122,7 +122,7 @@ class SoundServer:
 
 
 def find_session(server_pid: int | None) -> tuple[UserSession, Mapping[str, str]]:
-    """Return the session and environment of the `talk` server, or else of this process.
+    """Return the session and environment of the `talk` server or, without a server, of this process.
 
     This process counts if there is no server or its environment can't be read.
     """

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 class LoopRobotConnection(LoopConnection, RobotConnection):
-    """A connection to a robot that uses an asyncio event loop."""
+    """A connection to a robot, for use in an asyncio event loop."""
 
 
 class FleetRequest(FleetRequestCalls):

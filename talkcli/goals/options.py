@@ -312,13 +312,13 @@ class Option:
         return f"more than {low:g}" if self.excludes_minimum else f"{low:g} or more"
 
     def for_set(self) -> Option:
-        """Return a copy for `talk set`, with that command's flags and help."""
+        """Return a copy of the option for `talk set`, with that command's flags and help."""
         setting = self.setting
         assert setting
         return replace(self, env="", special_flags=setting.flags or self.flags, help=setting.set_help or self.help)
 
     def for_serve(self) -> Option:
-        """Return a copy for `talk serve`, with that command's flags, help and default."""
+        """Return a copy of the option for `talk serve`, with that command's flags, help and default."""
         setting = self.setting
         assert setting
         flags = (setting.flags or self.flags).split("/")[0]

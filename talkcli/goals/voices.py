@@ -135,7 +135,7 @@ class VoiceScheduler:
             del self._voices[voice]
 
     def patience_end(self, record: Record, voice: str) -> float:
-        """Return when the next goal stops waiting for its voice (monotonic), or 0 if it doesn't wait.
+        """Return the monotonic time at which the next goal stops waiting for its voice, or 0 if it doesn't wait.
 
         Urgent goals don't wait. Other goals stop waiting before they expire. A `voice_only` goal waits until its voice
         is loaded or has failed.

@@ -100,7 +100,7 @@ def row_to_json(row: Row) -> JsonObject:
 
 
 def without_text(goal: Goal) -> Goal:
-    """Return a copy of a goal without its text, and without all fields that may quote the text."""
+    """Return a copy of a goal without its text and without any fields that may quote the text."""
     by, hidden = goal.by and By(goal.by.goal, _without_command_line(goal.by.client)), dict.fromkeys(_TEXT_FIELDS)
     return replace(goal, client=_without_command_line(goal.client), by=by, **hidden)
 

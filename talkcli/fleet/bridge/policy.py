@@ -197,7 +197,7 @@ class Policy:
         return RemoteRequest(user, reply_topic, seq, request, correlation, size, start_by)
 
     def _is_flood(self, message: Message, kind: str, user: str, now: float) -> bool:
-        """Count a message. Return True if its user sends too many, unless the message is a `cancel`."""
+        """Count a message. Return True if its user has sent too many messages and it isn't a `cancel`."""
         if now >= self._second_ends_at:
             self._message_counts.clear()
             self._second_ends_at = now + 1.0
@@ -334,7 +334,7 @@ class RemoteGoals:
         self._goals.setdefault(goal_id, (key, False))
 
     def record_reply(self, goal_id: str, *, pending: bool) -> None:
-        """Record that a goal is pending, or remove it, according to the server's reply to `say`.
+        """Depending on the server's reply to `say`, record that a goal is pending or remove the goal.
 
         The reply is ignored if an event has already confirmed that the goal is pending.
 

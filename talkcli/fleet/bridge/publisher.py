@@ -225,7 +225,7 @@ class Publisher:
             self._last = event.goal or self._last
 
     def _add_text(self, event: TextAdded) -> None:
-        """Extend the stored start of a goal's text. If the status shows this text, schedule a status."""
+        """Add text to the stored beginning of a goal's text. If the status shows the text, schedule a status."""
         known = self._texts.get(event.id)
         if known and len(known) < _MAX_STATUS_TEXT_CHARS:
             self._texts[event.id] = (known + event.text)[:_MAX_STATUS_TEXT_CHARS]

@@ -462,7 +462,7 @@ class RemoteSession:
         return True
 
     def _new_goal_id(self) -> str:
-        """Generate an id for a goal that has none."""
+        """Generate an id for a goal without an id."""
         return f"{self._sessions.name[:_MAX_ID_PREFIX_CHARS]}-x{random.getrandbits(48):012x}"
 
     # -- from the server

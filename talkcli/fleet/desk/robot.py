@@ -300,7 +300,7 @@ class RobotConnection(Connection):
         return float("inf")
 
     def silence_deadline(self, waiting_since: float) -> tuple[float, str]:
-        """Return when a silent or absent robot counts as lost, and the error message for that."""
+        """Return the time at which a silent or absent robot counts as lost, and the error message."""
         if self.absent_since is None:
             return super().silence_deadline(waiting_since)
         return self.absent_since + ABSENCE_LIMIT_S, f"{self.absence} (for {ABSENCE_LIMIT_S:g} s)"
@@ -487,7 +487,7 @@ class RobotConnection(Connection):
         self._queue_exchange(Exchange(Wait((str(request.id),), request.feedback), on_reply, on_failure), now)
 
     def _queue_exchange(self, exchange: Exchange, now: float) -> None:
-        """Queue a lookup of one or all goals, and send it now unless too many are unanswered."""
+        """Queue a lookup of one or all goals, and send it now unless too many lookups are unanswered."""
         self._lookups.append(exchange)
         self._send_lookups(now)
 

@@ -86,7 +86,7 @@ def _boot_id(presence: Presence) -> str:
 
 
 def _speaking_cell(status: RobotStatus, screen: Screen) -> Cell:
-    """Return the cell for the active goal. It also shows whether speech is paused."""
+    """Return the cell for the active goal. The cell also shows whether speech is paused."""
     if status.active is None:
         return ("PAUSED", State.PREEMPTING) if status.paused else _EMPTY_CELL
     words = screen.goal_id(status.active) if status.text is None else f'"{printable(status.text)}"'
