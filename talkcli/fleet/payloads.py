@@ -211,82 +211,68 @@ def homeassistant_device(name: str, allow: Collection[str], version: str) -> Mes
         version: the bridge's version.
     """
     identifier, status, allowed = f"{topics.PREFIX}-{name}", topics.robot(name, topics.STATUS), frozenset(allow)
-    components: dict[str, JsonObject] = {
-        "say": {"platform": "notify", "name": None, "icon": "mdi:bullhorn", "command_template": _SAY_TEMPLATE},
-        "interrupt": {
-            "platform": "notify",
-            "name": "Interrupt",
-            "icon": "mdi:bullhorn-variant",
-            "command_template": _INTERRUPT_TEMPLATE,
-        },
-        "cancel": {
-            "platform": "button",
-            "name": "Cancel",
-            "icon": "mdi:stop",
-            "payload_press": _request_payload("cancel"),
-        },
-        "paused": {
-            "platform": "switch",
-            "name": "Paused",
-            "icon": "mdi:pause",
-            "state_topic": status,
-            "value_template": _PAUSED_TEMPLATE,
-            "state_on": "ON",
-            "state_off": "OFF",
-            "payload_on": _request_payload("pause"),
-            "payload_off": _request_payload("resume"),
-        },
-        "state": {
-            "platform": "sensor",
-            "name": "State",
-            "icon": "mdi:account-voice",
-            "state_topic": status,
-            "value_template": _STATE_TEMPLATE,
-            "device_class": "enum",
-            "options": ["idle", "speaking", "paused"],
-        },
-        "speaking": {
-            "platform": "binary_sensor",
-            "name": "Speaking",
-            "icon": "mdi:volume-high",
-            "state_topic": status,
-            "value_template": _SPEAKING_TEMPLATE,
-        },
-        "pending": {
-            "platform": "sensor",
-            "name": "Pending",
-            "icon": "mdi:tray-full",
-            "state_topic": status,
-            "value_template": "{{ value_json.pending }}",
-            "state_class": "measurement",
-            "entity_category": "diagnostic",
-        },
-        "last": {
-            "platform": "sensor",
-            "name": "Last result",
-            "icon": "mdi:message-check",
-            "state_topic": status,
-            "value_template": _LAST_TEMPLATE,
-            "device_class": "enum",
-            "options": _END_STATES,
-            "entity_category": "diagnostic",
-            "json_attributes_topic": status,
-            "json_attributes_template": "{{ (value_json.last or {}) | tojson }}",
-        },
-        "ended": {
-            "platform": "event",
-            "name": "Sentence ended",
-            "icon": "mdi:message-text-clock",
-            "state_topic": topics.robot(name, topics.EVENT, "state"),
-            "value_template": _END_TEMPLATE,
-            "event_types": _END_STATES,
-        },
+    components = {
+        "say": _component("notify", None, "bullhorn", command_template=_SAY_TEMPLATE),
+        "interrupt": _component("notify", "Interrupt", "bullhorn-variant", command_template=_INTERRUPT_TEMPLATE),
+        "cancel": _component("button", "Cancel", "stop", payload_press=_request_payload("cancel")),
+        "paused": _component(
+            "switch",
+            "Paused",
+            "pause",
+            state_topic=status,
+            value_template=_PAUSED_TEMPLATE,
+            state_on="ON",
+            state_off="OFF",
+            payload_on=_request_payload("pause"),
+            payload_off=_request_payload("resume"),
+        ),
+        "state": _component(
+            "sensor",
+            "State",
+            "account-voice",
+            state_topic=status,
+            value_template=_STATE_TEMPLATE,
+            device_class="enum",
+            options=["idle", "speaking", "paused"],
+        ),
+        "speaking": _component(
+            "binary_sensor", "Speaking", "volume-high", state_topic=status, value_template=_SPEAKING_TEMPLATE
+        ),
+        "pending": _component(
+            "sensor",
+            "Pending",
+            "tray-full",
+            state_topic=status,
+            value_template="{{ value_json.pending }}",
+            state_class="measurement",
+            entity_category="diagnostic",
+        ),
+        "last": _component(
+            "sensor",
+            "Last result",
+            "message-check",
+            state_topic=status,
+            value_template=_LAST_TEMPLATE,
+            device_class="enum",
+            options=_END_STATES,
+            entity_category="diagnostic",
+            json_attributes_topic=status,
+            json_attributes_template="{{ (value_json.last or {}) | tojson }}",
+        ),
+        "ended": _component(
+            "event",
+            "Sentence ended",
+            "message-text-clock",
+            state_topic=topics.robot(name, topics.EVENT, "state"),
+            value_template=_END_TEMPLATE,
+            event_types=_END_STATES,
+        ),
     }
     for key, component in components.items():
         needed = _NEEDED_REQUESTS.get(key, ())
         if needed:
             component["command_topic"] = topics.robot(name, topics.REQUEST, topics.HOMEASSISTANT)
-        component |= {"qos": 1, "unique_id": f"{identifier}-{key}"}
+        component["unique_id"] = f"{identifier}-{key}"
         if not allowed.issuperset(needed):
             components[key] = {"platform": component["platform"]}
     payload: JsonObject = {
@@ -302,6 +288,11 @@ def homeassistant_device(name: str, allow: Collection[str], version: str) -> Mes
         "components": components,
     }
     return Message(topics.homeassistant_device(name), encode(payload), retained=True)
+
+
+def _component(platform: str, name: str | None, icon: str, **keys: object) -> JsonObject:
+    """Return a component of the device with these keys."""
+    return {"platform": platform, "name": name, "icon": f"mdi:{icon}", "qos": 1, **keys}
 
 
 def _request_payload(kind: str) -> str:
