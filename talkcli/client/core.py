@@ -430,7 +430,7 @@ class ClientCore:
     # -- requests
 
     def register(self, exchange: Exchange, now: float) -> None:
-        """Give an exchange a number, and add it to the unanswered exchanges."""
+        """Number an exchange, and add it to the unanswered exchanges."""
         exchange.number = exchange.number or next(self._numbers)
         exchange.heard_at = now
         self.exchanges[exchange.number] = exchange
@@ -786,7 +786,7 @@ class ClientCore:
                     self.listeners.update(goal)
 
         def on_failure(error: TalkError) -> None:
-            if self.absent_since is None:  # if the connection has broken again, the next one will follow the goal
+            if self.absent_since is None:  # after another break, the next connection will follow the goal
                 self.listeners.lose(goal_id, f"{error.message}; the sentence may have been spoken")
 
         self._queue_exchange(Exchange(Wait((goal_id,), feedback), on_reply, on_failure), now)

@@ -224,7 +224,7 @@ class GoalHandle(GoalCalls):
 
 
 def merged(handles: Sequence[GoalHandle], timeout: float | None = None) -> Iterator[tuple[GoalHandle, Event]]:
-    """Yield each event of several goals with its goal's handle, until all of them have ended.
+    """Yield each event of several goals with its goal's handle, until all goals have ended.
 
     The last event of each goal is its Result. A pause of all speech is yielded only once. If the connection ends, the
     remaining goals end as LOST.

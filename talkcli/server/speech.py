@@ -95,7 +95,7 @@ class Speech:
         self.engine: Supervisor
         #: stores the goals that have ended, or None
         self.history: History | None = None
-        #: how to say terms, or None without a file of pronunciations
+        #: the file that says how to pronounce terms, or None
         self.pronunciation_file: PronunciationFile | None = None
         #: called when `status_message` may have changed
         self.on_status_change: Callable[[], None] = lambda: None

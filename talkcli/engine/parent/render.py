@@ -39,7 +39,7 @@ _FILE_REASONS = frozenset({Reason.AUDIO_DEVICE, Reason.AUDIO_LOST})
 #: Paths that refer to standard output. They don't need to be opened, because the shell has already opened standard
 #: output.
 STANDARD_OUTPUT = frozenset({"-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"})
-#: How often to check whether a named pipe has a reader. There is no event for this.
+#: How often to check whether a named pipe has a reader. No event reports a new reader.
 _READER_CHECK_INTERVAL_S = 0.05
 #: Maximum length of the text in one `Speak`, the same as for a goal. The engine sends no messages while it prepares a
 #: text, so a longer text could be mistaken for a hang.

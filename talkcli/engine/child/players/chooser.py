@@ -156,7 +156,7 @@ class PlayerChooser:
         return rate or voice_rate(voice or "")
 
     def record_output(self, player: Player) -> None:
-        """Record the device, volume and mute state of a player's output, and which player works.
+        """Record a player's output with its volume and mute state, and the player itself if it works.
 
         The player is recorded only if it was chosen automatically.
 
