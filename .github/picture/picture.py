@@ -68,7 +68,7 @@ class Frame(NamedTuple):
 
 
 class Screen:
-    """A terminal that supports the control sequences of `talk` and a shell."""
+    """A terminal that supports the control sequences of `talk` and of a shell."""
 
     def __init__(self) -> None:
         self.rows: list[list[Cell]] = [[]]
@@ -249,7 +249,7 @@ def picture(frames: list[Frame]) -> str:
 
 
 def _lives(frames: list[Frame], number: int, whole: float) -> list[tuple[Row, float, float]]:
-    """Return when each content of a row appears and disappears.
+    """Return the times at which each content of a row appears and disappears.
 
     Omit empty contents.
     """
