@@ -209,7 +209,7 @@ class Supervisor:
         self._goal: SupervisedGoal | None = None
         #: ID of the neural voice that the process is loading
         self._loading: str | None = None
-        #: time of the last event from the process, or of the last command that it must answer
+        #: time of the last event from the process, or of the last command that the process must answer
         self._last_sign_at = 0.0
         #: killed processes that may still be running, each with the time limit for its exit
         self._dying: dict[EngineProcess, float] = {}

@@ -352,7 +352,7 @@ class ProgramPlayer(Player):
     def _read_stderr(self) -> None:
         """Read the program's new error output without blocking, and look for an error message in it."""
         stderr = self._process.stderr
-        data = None if stderr.closed else stderr.read(65536)  # None if there is nothing to read
+        data = None if stderr.closed else stderr.read(65536)  # `read` returns None if there is no data
         if data:
             self._errors.feed(data)
         elif data == b"":
