@@ -54,7 +54,7 @@ ALL_EXIT_CODES: ExitCodes = {
     6: "recalled: the goal was removed from the queue before it was spoken",
     7: "preempted: the goal was stopped while it was being spoken",
     8: "unknown goal",
-    9: "the server's version doesn't fit this client",
+    9: "the server's version is incompatible with this client",
     10: "permission denied",
     11: "serve: the socket is in use or its directory isn't safe; bridge: another robot has this name",
     12: "lost: the connection was lost after the goal was sent, so it may still be spoken",

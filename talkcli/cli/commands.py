@@ -53,7 +53,7 @@ def _say_options() -> Iterator[Option]:
             yield replace(each, env="", help=f"{each.help}  [env var with -o: {each.env}]") if each.env else each
         if each.name == "wait":
             yield _timeout_option(
-                "With --wait, cancel the sentence after TIME, such as 20s. The time in the queue counts."
+                "With --wait, cancel the sentence after TIME, such as 20s. This includes the time in the queue."
             )
         elif each.name == "id":
             what = "Set the sender's name, which is shown in the log."
@@ -144,7 +144,7 @@ def _play_fault(values: Mapping[str, Any], typed: frozenset[str]) -> str | None:
     return _goal_fault(values)
 
 
-_PRONOUNCE_HELP = "Say words as FILE defines. It has lines such as: GmbH = gay em bay ha. A changed file is read again."
+_PRONOUNCE_HELP = "Say words as FILE defines. Its lines look like: GmbH = gay em bay ha. A changed file is read again."
 _SERVE_OPTIONS = (
     *(each.for_serve() for each in goal_options.SETTINGS),
     # At two seconds per sentence, 100 goals are more than three minutes of speech. Searching a queue of the maximum
@@ -604,7 +604,7 @@ _ROWS = (
         name="completion",
         summary="Print the completion script for a shell.",
         description="""
-        Print the completion script for bash, zsh or fish, to be loaded by the shell's start file.
+        Print the completion script for bash, zsh or fish, to be loaded by the shell's startup file.
 
         Tab then completes commands, options and their values. While a server runs, Tab also completes goal ids, keys
         and voices.

@@ -292,7 +292,7 @@ def judge_settings(message: str, *, has_url: bool) -> Finding:
     """
     if not has_url:
         return failure("broker", f"{URL} is not set", f"export {URL}=mqtts://broker.example")
-    return failure("broker", message, "correct it in the shell's start file, or in the unit's EnvironmentFile=")
+    return failure("broker", message, "correct it in the shell's startup file, or in the unit's EnvironmentFile=")
 
 
 def judge_unreachable(broker: Broker, reason: str) -> Finding:

@@ -186,9 +186,9 @@ def test_topics_that_a_robot_may_not_write_or_read_are_listed() -> None:
     ("changed", "expected", "step"),
     [
         ({"TALK_BROKER": ""}, "TALK_BROKER is not set", "export TALK_BROKER=mqtts://broker.example"),
-        ({"TALK_BROKER": "http://x"}, "TALK_BROKER is not the URL of a broker", "correct it in the shell's start file"),
+        ({"TALK_BROKER": "http://x"}, "TALK_BROKER is not the URL of a broker", "correct it in the shell's startup"),
         ({"TALK_BROKER": "mqtts://x", "TALK_MQTT_CA": "/no/ca"}, "TALK_MQTT_CA: /no/ca: No such file", "correct it"),
-        ({"TALK_MQTT_USER": "a/b"}, "invalid user name 'a/b'", "correct it in the shell's start file"),
+        ({"TALK_MQTT_USER": "a/b"}, "invalid user name 'a/b'", "correct it in the shell's startup"),
         ({"TALK_BROKER": "mqtt://no-such.invalid"}, ":1883: no such host", "correct the host in TALK_BROKER"),
         ({"TALK_BROKER": "mqtt://no..such"}, ":1883: no such host", "correct the host in TALK_BROKER"),
     ],
