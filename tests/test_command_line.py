@@ -202,23 +202,6 @@ def test_arguments_and_output_are_utf8_in_every_locale(scripted: Talk) -> None:
         assert "日本" in run([*TALK, "status"], env).out
 
 
-def test_text_from_others_is_always_escaped(scripted: Talk) -> None:
-    goal_id = scripted.run("say", "--as", HOSTILE[:60], "--", f"never-ends {HOSTILE}").id
-    scripted.watcher.wait_for_word(goal_id)
-    scripted.run("say", "--wait", "--as", "b\x1b]0;title\x07", "-t", "0.1", "--", f"{HOSTILE} pending")
-    shown = [scripted.run("status").out, scripted.run("status", goal_id).out]
-    # If a script forgets the quotes, talk takes text for commands, options or ids.
-    commands = (["wait"], ["cancel"], ["status"], ["cancel", "--before"])
-    shown += [scripted.run(*command, HOSTILE).err for command in commands]
-    shown += [scripted.run(HOSTILE).err, scripted.run("say", f"--{HOSTILE}").err, scripted.run("voices", HOSTILE).err]
-    shown += [scripted.run("voices", "--language", HOSTILE).err, scripted.log]
-    for text in shown:
-        assert text
-        assert not RAW.search(text), repr(text)
-        assert not re.search("(?m)^fake line", text), repr(text)
-    assert r"a\x1b[31mred\u202egnp.exe\nfake line\x07\x85\u2028end" in shown[0]
-
-
 @pytest.mark.parametrize("command", [["status"], ["watch"], ["say", "--id", "shared", "-w"]])
 def test_json_on_a_terminal_is_escaped_without_changing_its_meaning(scripted: Talk, command: list[str]) -> None:
     text = f'length=0 {HOSTILE} \x9b31m \x7f \ue000 \U000e0001 "quoted" \\ Grüße 日本 👩'

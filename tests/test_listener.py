@@ -7,7 +7,6 @@ import shutil
 import socket
 import stat
 import subprocess
-import sys
 import threading
 
 import click
@@ -15,18 +14,11 @@ import pytest
 
 import talkcli
 from talkcli.server import listener
-from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
+from tests.conformance.bareserve import SERVE, environment, run, serving
 from tests.support.connection import Wire
 from tests.support.surroundings import needs
 
 NOBODY = 65534
-#: A script that starts a program and passes a socket to it, as systemd does.
-PASSING = """
-import os, sys
-os.dup2(int(sys.argv[1]), 3)
-os.environ["LISTEN_PID"] = str(os.getpid())
-os.execv(sys.argv[2], sys.argv[2:])
-"""
 
 
 def refused(home: str, *arguments: str, code: int = 11, **extra: str) -> str:
@@ -168,21 +160,3 @@ def test_a_refused_client_of_another_user_exits_with_10(home: str) -> None:
         assert "talk serve\n" not in done.err, "a new server would use the same path"
     with serving(environment(home), "--socket", path, "--socket-mode", "0666"):
         assert run([*client, "--socket", path, "say", "--wait", "hi"], other_user).code == 0
-
-
-def test_a_passed_socket_is_served_and_not_removed(home: str) -> None:
-    path = f"{home}/passed"
-    with socket.socket(socket.AF_UNIX) as listening:
-        listening.bind(path)
-        listening.listen()
-        fd = listening.fileno()
-        command = [sys.executable, "-c", PASSING, str(fd), *SERVE]
-        with serving(environment(home, LISTEN_FDS="1"), command=command, pass_fds=[fd]):
-            done = run([*TALK, "--socket", path, "say", "--wait", "hello"], environment(home))
-            assert done.code == 0, done
-        assert os.path.exists(path)
-        with socket.socket(socket.AF_UNIX) as client:
-            client.connect(path)  # systemd still listens on the socket
-    several = run([sys.executable, "-c", PASSING, "1", *SERVE], environment(home, LISTEN_FDS="2"))
-    assert several.code == 2
-    assert "LISTEN_FDS" in several.err

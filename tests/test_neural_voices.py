@@ -506,7 +506,7 @@ _SIDE_EFFECTS = re.compile(
 )
 
 
-@pytest.mark.parametrize("seconds", [0, pytest.param(30, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seconds", [0, pytest.param(10, marks=pytest.mark.slow)])
 def test_a_neural_voice_contacts_no_host_and_changes_no_file(env: dict[str, str], tmp_path: Path, seconds: int) -> None:
     """Even if the user enables onnxruntime's telemetry, which looks up its host 9 seconds after the import."""
     needs("strace")

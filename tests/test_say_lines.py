@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli.client.core import SILENCE_LIMIT_S
 from tests.conformance.bareserve import TALK, environment
 from tests.support.forking import Forked
 from tests.support.surroundings import short_directory
@@ -213,17 +212,6 @@ def test_lines_whose_ttl_expires_are_dropped(make_talk: MakeTalk, options: list[
         assert sorted((goal["state"], goal["reason"], goal["text"]) for goal in goals) == [
             ("RECALLED", "expired", f"length=0 {word}") for word in ("one", "three", "two")
         ]
-
-
-@pytest.mark.slow
-def test_a_line_is_spoken_after_a_long_pause_in_the_input(scripted: Talk) -> None:
-    typing = Typing(scripted, "say", "--lines")
-    typing.type("length=0 one\n")
-    scripted.watcher.wait_for(typing.line(), "SUCCEEDED")
-    time.sleep(SILENCE_LIMIT_S + 1)  # an idle server doesn't report that it is alive
-    typing.type("length=0 two\n")
-    scripted.watcher.wait_for(typing.line(), "SUCCEEDED")
-    assert typing.end()[0] == 0
 
 
 @limits()

@@ -1,6 +1,6 @@
 """An independent recognizer understands the speech.
 
-It hears the same sound as a loudspeaker, and chooses among twenty sentences. By chance, it would get one of them right.
+It hears what a player gets, and chooses among twenty sentences. By chance, it would get one of them right.
 """
 
 from __future__ import annotations
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tests.conftest import MakeTalk
-    from tests.support.processes import Talk
-    from tests.support.sink import Sink
 
 SENTENCES = """
 battery low
@@ -50,42 +48,32 @@ speech volume is now at fifty percent
 ESPEAK = "gmw/en"
 
 
-def say(talk: Talk, sentence: str, voice: str = REAL_VOICE) -> None:
-    done = talk.run("say", "--wait", "--voice", voice, "--", sentence)
-    assert (done.code, talk.goal(done.id)["voice"]) == (0, voice), done
+def count_understood(make_talk: MakeTalk, directory: Path, voice: str, sentences: list[str]) -> int:
+    """Speak sentences to a file, which is faster than real time, and return how many of them are recognized."""
+    real_voice()
+    needs_packages(PACKAGE)
+    path = directory / "speech.wav"
+    env = {"XDG_CACHE_HOME": str(directory / "cache")}
+    talk = serve_with_voice(make_talk, REAL_VOICE, "--player", f"file:{path}", sink=None, env=env)
+    before, understood = 0, 0
+    for sentence in sentences:
+        done = talk.run("say", "--wait", "--voice", voice, "--", sentence)
+        assert (done.code, talk.goal(done.id)["voice"]) == (0, voice), done
+        with wave.open(str(path)) as file:
+            samples = np.frombuffer(file.readframes(file.getnframes()), "<i2").astype(np.int16)
+        understood += recognize(samples[before:], SENTENCES) == sentence
+        before = len(samples)
+    return understood
 
 
 def test_sentences_of_a_neural_voice_are_understood(make_talk: MakeTalk, tmp_path: Path) -> None:
-    real_voice()
-    needs_packages(PACKAGE)
-    path = tmp_path / "speech.wav"
-    env = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
-    talk = serve_with_voice(make_talk, REAL_VOICE, "--player", f"file:{path}", sink=None, env=env)
-    before, understood = 0, []
-    for sentence in SENTENCES[::4]:
-        say(talk, sentence)
-        with wave.open(str(path)) as file:
-            samples = np.frombuffer(file.readframes(file.getnframes()), "<i2").astype(np.int16)
-        understood.append(recognize(samples[before:], SENTENCES))
-        before = len(samples)
-    assert understood == SENTENCES[::4]
+    assert count_understood(make_talk, tmp_path, REAL_VOICE, SENTENCES[::4]) == len(SENTENCES[::4])
 
 
-@pytest.mark.slow  # both voices speak all sentences in real time: a minute and a half
-def test_a_neural_voice_is_understood_as_well_as_espeak(make_talk: MakeTalk, sink: Sink, tmp_path: Path) -> None:
-    real_voice()
-    needs_packages(PACKAGE)
-    env = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
-    talk = serve_with_voice(make_talk, REAL_VOICE, sink=sink, env=env)
-    wrong: dict[str, list[tuple[str, str]]] = {ESPEAK: [], REAL_VOICE: []}
-    for sentence in SENTENCES:
-        for voice, mistakes in wrong.items():
-            with sink.record() as recording:
-                say(talk, sentence, voice)
-            recognised = recognize(recording.samples, SENTENCES)
-            if recognised != sentence:
-                mistakes.append((sentence, recognised))
-    assert len(wrong[REAL_VOICE]) <= min(1, len(wrong[ESPEAK])), wrong
+@pytest.mark.slow
+def test_a_neural_voice_is_understood_as_well_as_espeak(make_talk: MakeTalk, tmp_path: Path) -> None:
+    espeak, neural = (count_understood(make_talk, tmp_path, voice, SENTENCES) for voice in (ESPEAK, REAL_VOICE))
+    assert neural >= max(len(SENTENCES) - 1, espeak)
 
 
 def test_no_sentence_is_recognised_in_noise() -> None:

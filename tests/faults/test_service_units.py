@@ -28,7 +28,6 @@ from tests.support.connection import Wire
 from tests.support.processes import children
 from tests.support.surroundings import needs, needs_packages
 from tests.support.timing import assert_within, limits
-from tests.tools.bench.machine import processor_use
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -490,14 +489,3 @@ def test_a_server_that_cannot_start_never_reports_ready(home: str) -> None:
         finally:
             second.close()
         assert not supervisor.receive(0.1)
-
-
-@pytest.mark.slow
-def test_an_idle_supervised_server_wakes_less_than_once_a_second(home: str) -> None:
-    with Supervisor(f"{home}/n") as supervisor:
-        env = supervised_env(home, supervisor, WATCHDOG_USEC="30000000")
-        with serving(env, command=SCRIPTED) as server:
-            supervisor.wait_for("STATUS", "idle; ")
-            before = processor_use([server.process.pid]).switches
-            time.sleep(4)
-            assert processor_use([server.process.pid]).switches - before < 4

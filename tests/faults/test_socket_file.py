@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
 import shutil
 import signal
@@ -24,7 +23,6 @@ from tests.support.connection import Wire
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tests.support.processes import Process
 
 HASTY = [sys.executable, os.path.join(os.path.dirname(os.path.abspath(__file__)), "hasty_serve.py")]
 SCRIPTED = [SERVE[0], processes.SCRIPTED]
@@ -165,24 +163,19 @@ def test_a_server_replaced_by_another_one_exits_with_code_11(home: str) -> None:
             await_server(path, second.process.pid)
 
 
-def any_ended(*processes: Process) -> bool:
-    return any(process.poll() is not None for process in processes)
-
-
 def test_of_two_servers_whose_files_were_removed_one_remains(home: str) -> None:
     path = f"{home}/s"
     env = environment(home, TALK_SOCKET=path)
-    for _ in range(2):
-        with serving(env, command=HASTY) as first:
-            os.kill(first.process.pid, signal.SIGSTOP)
+    with serving(env, command=HASTY) as first:
+        os.kill(first.process.pid, signal.SIGSTOP)
+        unlink_both(path)
+        with serving(env, command=HASTY) as second:
             unlink_both(path)
-            with serving(env, command=HASTY) as second:
-                unlink_both(path)
-                os.kill(first.process.pid, signal.SIGCONT)
-                both = (first.process, second.process)
-                await_true(functools.partial(any_ended, *both))
-                assert sorted([server.poll() for server in both], key=str) == [11, None]
-                await_server(path, next(server.pid for server in both if server.poll() is None))
+            os.kill(first.process.pid, signal.SIGCONT)
+            both = (first.process, second.process)
+            await_true(lambda: any(process.poll() is not None for process in both))
+            assert sorted([server.poll() for server in both], key=str) == [11, None]
+            await_server(path, next(server.pid for server in both if server.poll() is None))
 
 
 def test_a_socket_that_another_program_puts_there_is_left_intact(home: str) -> None:

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 #: Servers that speak at the maximum rate.
 AUDIBLE = [*TALK, "serve", "--rate", "450"]
 QUIET = [*SERVE, "--rate", "450"]
-VARIABLES = ("HOME", "PATH", "LANG", "TMPDIR")
 
 
 @contextlib.contextmanager
@@ -106,21 +105,15 @@ def test_an_unusable_socket_directory_is_reported_clearly(home: str) -> None:
     assert (done.code, f"{home}/file/talk" in done.err, "Traceback" in done.err) == (11, True, False), done
 
 
-@pytest.mark.parametrize(
-    "missing",
-    [VARIABLES, *(pytest.param((name,), marks=pytest.mark.slow) for name in VARIABLES if name != "HOME"), "/proc", ""],
-    ids=str,
-)
-def test_speech_works_with_missing_variables_or_a_missing_home(
-    home: str, sink: Sink, missing: tuple[str, ...] | str
-) -> None:
+@pytest.mark.parametrize("place", [None, "/proc", ""])
+def test_speech_works_with_missing_variables_or_a_missing_home(home: str, sink: Sink, place: str | None) -> None:
     env = environment(home, **{**sink.env, "TALK_SOCKET": f"{home}/s"})
     assert "XDG_RUNTIME_DIR" not in env  # see `test_servers_places`
-    if isinstance(missing, str):
-        env["HOME"] = missing
+    if place is None:
+        env = {name: value for name, value in env.items() if name not in ("HOME", "PATH", "LANG", "TMPDIR")}
     else:
-        env = {name: value for name, value in env.items() if name not in missing}
-    if "PATH" in missing and not any(os.access(f"/{place}/pacat", os.X_OK) for place in ("bin", "usr/bin")):
+        env["HOME"] = place
+    if "PATH" not in env and not any(os.access(f"/{place}/pacat", os.X_OK) for place in ("bin", "usr/bin")):
         pytest.skip("the player is not in a directory that is searched without PATH")
     # Not aplay, which reads its settings for this sink from the home.
     with serving(env, "--player", "pacat", command=AUDIBLE) as server:
@@ -178,7 +171,7 @@ def test_a_jump_of_the_wall_clock_changes_no_timer_or_throttle(
     talk.watcher.wait_for_word(active)
     started_at = time.monotonic()
     with talk.connect() as wire:
-        short = wire.request("say", text="one", ttl=1)["goal"]["id"]
+        short = wire.request("say", text="one", ttl=0.5)["goal"]["id"]
         long = wire.request("say", text="two", ttl=20)["goal"]["id"]
     os.replace(write(tmp_path / "new", str(seconds)), offset)
     jumped = talk.request("say", text="")["goal"]
@@ -186,7 +179,7 @@ def test_a_jump_of_the_wall_clock_changes_no_timer_or_throttle(
     refused = talk.request("say", text="length=0.05 battery low", throttle=60)["goal"]
     assert (refused["state"], refused["reason"]) == ("REJECTED", "throttled")
     assert talk.watcher.wait_for_terminal(short, 10) == "RECALLED"
-    assert 1 - 0.05 <= time.monotonic() - started_at <= 1 + LATE
+    assert 0.5 - 0.05 <= time.monotonic() - started_at <= 0.5 + LATE
     assert talk.goal(long)["state"] == "PENDING"
     assert talk.request("status")["server"]["uptime"] < 60
     throttle = time.monotonic() - spoken_at - 0.1

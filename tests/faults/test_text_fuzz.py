@@ -10,9 +10,9 @@ import pytest
 
 from tests.tools.fuzz_texts import Case, cases, crashers, daily_seed, list_voices, speak_all
 
-SECONDS = float(os.environ.get("TALK_TEST_FUZZ") or (30 if os.environ.get("CI") else 10))
+SECONDS = float(os.environ.get("TALK_TEST_FUZZ") or (30 if os.environ.get("CI") else 5))
 #: Number of texts of each kind that crashes libespeak-ng.
-TEXTS_PER_KIND = 12
+TEXTS_PER_KIND = 6
 
 
 @pytest.mark.parametrize("growing", [False, True], ids=["whole", "growing"])
