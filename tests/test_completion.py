@@ -36,24 +36,11 @@ CHECKED_IN = os.path.join(os.path.dirname(os.path.dirname(os.path.abspath(__file
 KEY = 'low battery, now: it\'s $5 "x" *\\ a;b|c&'
 #: The file of each shell's script.
 FILES = {"bash": "talk.bash", "zsh": "_talk", "fish": "talk.fish"}
-#: For each shell: options that skip its start files, commands that load the script, and commands that let ^G write the
-#: command line to the file OUT.
+#: For each shell: commands that let ^G write the command line to the file OUT.
 SHELLS = {
-    "bash": (
-        ["--noprofile", "--norc"],
-        "source SCRIPTS/talk.bash; ",
-        """bind -x '"\\C-g": printf "%s\\n" "$READLINE_LINE" > OUT'; PS1='rea''dy> '\n""",
-    ),
-    "zsh": (
-        ["-f"],
-        "autoload -U compinit; compinit -u -D; source SCRIPTS/_talk; ",
-        "show() { print -r -- $BUFFER > OUT }; zle -N show; bindkey '^G' show; PS1='rea''dy> '\n",
-    ),
-    "fish": (
-        ["--no-config"],
-        "source SCRIPTS/talk.fish; ",
-        "bind \\cg 'commandline > OUT'; function fish_prompt; echo 'rea''dy> '; end\n",
-    ),
+    "bash": """bind -x '"\\C-g": printf "%s\\n" "$READLINE_LINE" > OUT'; PS1='rea''dy> '\n""",
+    "zsh": "show() { print -r -- $BUFFER > OUT }; zle -N show; bindkey '^G' show; PS1='rea''dy> '\n",
+    "fish": "bind \\cg 'commandline > OUT'; function fish_prompt; echo 'rea''dy> '; end\n",
 }
 #: bash-completion, if it is installed. It has a completion for an older program named `talk`.
 BASH_COMPLETION = "/usr/share/bash-completion/bash_completion"
@@ -149,7 +136,7 @@ def test_goal_ids_are_offered_with_their_texts(busy: tuple[Talk, list[str]]) -> 
     assert values("talk cancel 999", talk) == []
 
 
-def test_keys_and_voices_are_offered(busy: tuple[Talk, list[str]]) -> None:
+def test_keys_voices_and_sounds_are_offered(busy: tuple[Talk, list[str]]) -> None:
     talk, _ = busy
     assert values("talk cancel --key ", talk) == [KEY, "plain"]
     assert values("talk say --key ", talk) == [KEY, "plain", "over"]
@@ -158,10 +145,6 @@ def test_keys_and_voices_are_offered(busy: tuple[Talk, list[str]]) -> None:
         assert offered(line, talk.env) == [("en", "scripted")]
     assert values("talk set --voice scr", talk) == ["scripted"]
     assert values("talk set --voice=e", talk) == ["--voice=en"]
-
-
-def test_sounds_are_offered(busy: tuple[Talk, list[str]]) -> None:
-    talk, _ = busy
     assert values("talk play ", talk) == ["chirp", "error", "warning"]
     assert values("talk play -w e", talk) == ["error"]
 
@@ -218,13 +201,16 @@ def test_completion_is_silent_and_quick_with_any_server(greeting: bytes | None) 
 
 
 class Shell:
-    """An interactive shell that completes `talk`, in a terminal."""
+    """An interactive shell in a terminal. The README's start files load the completion of `talk`.
 
-    def __init__(self, name: str, talk: Talk, stack: contextlib.ExitStack, lines: str | None = None) -> None:
-        """`lines`: sh commands that create start files that load the script; None for no start files."""
+    bash loads bash-completion first, as on most machines.
+    """
+
+    def __init__(self, name: str, talk: Talk, stack: contextlib.ExitStack) -> None:
         needs(name)
+        if name == "bash" and not os.path.exists(BASH_COMPLETION):
+            needs("bash-completion")
         directory = talk.directory
-        bare, load, setup = SHELLS[name]
         os.makedirs(f"{directory}/bin")
         with open(f"{directory}/bin/talk", "w", encoding="utf-8") as program:
             program.write(f'#!/bin/sh\nexec "{sys.executable}" -m talkcli "$@"\n')
@@ -232,16 +218,12 @@ class Shell:
         os.mkfifo(f"{directory}/out")
         self._out = os.open(f"{directory}/out", os.O_RDWR)
         stack.callback(os.close, self._out)
-        env = {**talk.env, "PATH": f"{directory}/bin:{os.environ['PATH']}", "TERM": "xterm", "HISTFILE": ""}
-        command = [name, *bare, "-i"]
-        if lines is None:
-            setup = load + setup
-        else:
-            env["HOME"] = directory
-            assert run(["sh", "-c", lines], env).code == 0
-            command = [name, "-i"]
-        self.terminal = stack.enter_context(Terminal(command, env, 500))
-        self.terminal.type(setup.replace("SCRIPTS", CHECKED_IN).replace("OUT", f"{directory}/out").encode())
+        path = f"{directory}/bin:{os.environ['PATH']}"
+        env = {**talk.env, "HOME": directory, "PATH": path, "TERM": "xterm", "HISTFILE": ""}
+        start_files = f"mkdir -p ~/.config/fish; echo '. {BASH_COMPLETION}' > ~/.bashrc\n" + block("Completion")
+        assert run(["sh", "-c", start_files], env).code == 0
+        self.terminal = stack.enter_context(Terminal([name, "-i"], env, 500))
+        self.terminal.type(SHELLS[name].replace("OUT", f"{directory}/out").encode())
         self.terminal.wait_for("ready> ", 20)
 
     def complete(self, line: str) -> str:
@@ -260,7 +242,7 @@ IN_DOUBLE = r'"low battery, now: it' + "'" + r's \$5 \"x\" *\\ a;b|c&"'
 
 
 @pytest.mark.parametrize("name", SHELLS)
-def test_shells_complete_and_quote_ids_keys_and_options(busy: tuple[Talk, list[str]], name: str) -> None:
+def test_shells_complete_and_quote_ids_keys_and_options_and_show_texts(busy: tuple[Talk, list[str]], name: str) -> None:
     talk, (_, _, pending) = busy
     in_single = {"fish": r"'low battery, now: it\'s $5 \"x\" *\\ a;b|c&'".replace('\\"', '"')}.get(
         name, r"""'low battery, now: it'\''s $5 "x" *\ a;b|c&'"""
@@ -280,34 +262,14 @@ def test_shells_complete_and_quote_ids_keys_and_options(busy: tuple[Talk, list[s
         f"talk --socket {talk.directory}/bin/t": f"talk --socket {talk.directory}/bin/talk ",
         "~/bin/talk cancel /door": "~/bin/talk cancel /door:open/1 ",
     }
+    if name == "bash":  # through bash-completion
+        expected["sudo talk cancel --before=/door:"] = "sudo talk cancel --before=/door:open/1 "
     with contextlib.ExitStack() as stack:
         shell = Shell(name, talk, stack)
         completed = {line: shell.complete(line) for line in expected}
+        if name != "bash":  # it shows only the values
+            shell.terminal.type(b"talk cancel \t")
+            shell.terminal.wait_for(r"ACTIVE moving, slowly: never-ends\\t\\x1b", 20)
+            shell.terminal.wait_for("PENDING battery low", 20)
     assert completed == expected
     assert "rror" not in shell.terminal.text
-
-
-@pytest.mark.parametrize("name", SHELLS)
-def test_the_readmes_start_files_load_the_completion(busy: tuple[Talk, list[str]], name: str) -> None:
-    """bash loads bash-completion first, as on most machines."""
-    talk, _ = busy
-    if name == "bash" and not os.path.exists(BASH_COMPLETION):
-        needs("bash-completion")
-    before = f"mkdir -p ~/.config/fish; echo '. {BASH_COMPLETION}' > ~/.bashrc\n"
-    with contextlib.ExitStack() as stack:
-        shell = Shell(name, talk, stack, before + block("Completion"))
-        completed = [shell.complete(line) for line in ("talk st", "talk cancel /door:o")]
-        if name == "bash":  # through bash-completion
-            assert shell.complete("sudo talk cancel --before=/door:") == "sudo talk cancel --before=/door:open/1 "
-    assert completed == ["talk status ", "talk cancel /door:open/1 "]
-    assert "rror" not in shell.terminal.text
-
-
-@pytest.mark.parametrize("name", ["zsh", "fish"])
-def test_zsh_and_fish_show_the_texts_of_goals(busy: tuple[Talk, list[str]], name: str) -> None:
-    talk, _ = busy
-    with contextlib.ExitStack() as stack:
-        shell = Shell(name, talk, stack)
-        shell.terminal.type(b"talk cancel \t")
-        shell.terminal.wait_for(r"ACTIVE moving, slowly: never-ends\\t\\x1b", 20)
-        shell.terminal.wait_for("PENDING battery low", 20)

@@ -31,7 +31,7 @@ from tests.support.surroundings import clean_environment, needs
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Iterator, Mapping
 
     from tests.conftest import MakeTalk
     from tests.support.connection import Message
@@ -156,16 +156,6 @@ def test_silent_neither_waits_for_goals_nor_adds_any(robot: Talk) -> None:
         assert logged(robot) == before
 
 
-def test_a_muted_sink_is_a_failure_although_the_sentence_was_played(robot: Talk, sink: Sink) -> None:
-    sink.pactl("set-sink-mute", "null", "1")
-    try:
-        findings = doctor(robot.env, "--silent")
-    finally:
-        sink.pactl("set-sink-mute", "null", "0")
-    assert findings["sentence"]["state"] == "ok"
-    assert (findings["loudness"]["state"], findings["loudness"]["message"]) == ("failed", "the default sink is muted")
-
-
 def test_sound_is_not_checked_here_if_the_socket_is_forwarded(robot: Talk, sink: Sink) -> None:
     """With ssh -L, the server's player is on another machine."""
     needs("socat")
@@ -214,23 +204,6 @@ def test_a_failed_custom_player_is_reported_with_a_command_to_test_it(make_talk:
     shown = done.out.splitlines()[-1]
     assert "sentence      ABORTED, audio_" in shown
     assert shown.endswith(f"no such card -> {step}")
-    findings = doctor(talk.env, "--silent")
-    assert findings["sentence"]["next"] == step
-    assert findings["recent goals"]["state"] == "warning"
-    assert "ABORTED: the last goal, " in findings["recent goals"]["message"]
-
-
-@pytest.mark.slow
-def test_a_hanging_sound_server_is_reported(make_talk: MakeTalk, private_sink: Callable[[], Sink]) -> None:
-    sink = private_sink()
-    talk = make_talk(sink=sink, forked=False)
-    sink.freeze()
-    findings = doctor(talk.env)
-    sink.thaw()
-    assert findings["sound server"]["state"] == "warning"
-    assert "does not answer from the server" in findings["sound server"]["message"]
-    assert findings["sentence"]["state"] == "failed"
-    assert findings["sentence"]["next"] == findings["sound server"]["next"]
 
 
 # The sentence, sent to a server
@@ -264,7 +237,7 @@ def test_a_sentence_that_waits_too_long_is_cancelled(scripted: Talk) -> None:
 def test_the_sentence_preempts_no_goal(make_talk: MakeTalk) -> None:
     talk = make_talk("--preempt", scripted=True)
     with Client(talk.socket) as client:
-        first = client.say("sentence length=0.5")
+        first = client.say("sentence length=0.1")
         assert sentence.speak_by_server(client, SENTENCE_TEXT, 10).state is State.SUCCEEDED
         assert first.wait(10).state is State.SUCCEEDED
 
@@ -343,14 +316,14 @@ def test_hanging_programs_only_delay_the_doctor(home: str, monkeypatch: pytest.M
         write(Path(home, "run", name), "#!/bin/sh\nexec sleep 98\n", 0o755)
     env = environment(home, TALK_SOCKET=f"{home}/s")
     monkeypatch.setattr(os, "environ", {**env, "PATH": f"{home}/run:{env['PATH']}"})
-    monkeypatch.setattr(sound, "PROGRAM_LIMIT_S", 0.3)
-    monkeypatch.setattr(examine, "SENTENCE_LIMIT_S", 0.6)
+    monkeypatch.setattr(sound, "PROGRAM_LIMIT_S", 0.1)
+    monkeypatch.setattr(examine, "SENTENCE_LIMIT_S", 0.2)
     started_at = time.monotonic()
     findings = list(examine.LocalExamination(None, silent=False).findings())
     assert time.monotonic() - started_at < LIMIT_S / 2
     assert next_steps(findings)
     messages = {finding.check: finding.message for finding in findings}
-    assert "no answer within 0.3 s" in messages["device"]
+    assert "no answer within 0.1 s" in messages["device"]
     assert "does not answer" in messages["sound server"]
 
 

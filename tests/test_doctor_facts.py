@@ -118,7 +118,7 @@ def test_a_process_that_admits_no_client_is_reported(home: str, greeting: str, m
 
 @pytest.mark.usefixtures("nobody_serves")
 def test_a_stopped_or_full_server_is_reported(make_talk: MakeTalk, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(SocketConnection, "open", partial(SocketConnection.open, patience_s=0.5))
+    monkeypatch.setattr(SocketConnection, "open", partial(SocketConnection.open, patience_s=0.2))
     talk = make_talk("--max-clients", "1", scripted=True, watched=False)
     with talk.connect() as wire:
         assert wire.request("hello")["ok"]
@@ -265,7 +265,6 @@ def test_the_devices_of_each_player_are_listed(tmp_path: Path) -> None:
         "pacat": "the default device; pactl list short sinks lists usb, hdmi",
         "pw-cat": "the default device; pw-cli ls Node lists alsa_output.usb",
     }
-    assert "my-player" not in sound.DEVICE_LISTS
     assert sound.suspended_sinks(env) == ("usb",)
 
 
@@ -285,11 +284,11 @@ def test_a_device_is_looked_up_in_its_players_list(tmp_path: Path) -> None:
 
 
 def test_errors_of_failed_and_hanging_programs_are_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sound, "PROGRAM_LIMIT_S", 0.3)
+    monkeypatch.setattr(sound, "PROGRAM_LIMIT_S", 0.1)
     env = env_with(tmp_path, aplay="exec /bin/sleep 98", pactl="echo Connection refused >&2; exit 1")
     findings = [sound.check_device(env, player, None) for player in ("aplay", "pacat", "pw-cat")]
     assert [(finding.state, re.split(": |because ", finding.message)[-1]) for finding in findings] == [
-        (WARNING, "no answer within 0.3 s"), (OK, "Connection refused"), (OK, "pw-cli is not installed")
+        (WARNING, "no answer within 0.1 s"), (OK, "Connection refused"), (OK, "pw-cli is not installed")
     ]  # fmt: skip
     assert sound.find_sound_server(env, STRANGER).hangs is False
     assert sound.find_sound_server(env_with(tmp_path, pactl="exec /bin/sleep 98", pw_cli="exit 0"), STRANGER).hangs

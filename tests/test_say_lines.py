@@ -265,10 +265,10 @@ def test_lines_wait_for_room_and_none_is_lost(make_talk: MakeTalk) -> None:
 
 def test_several_hundred_lines_are_spoken_per_second(make_talk: MakeTalk) -> None:
     talk = make_talk(scripted=True, watched=False)
-    lines = [f"length=0 {number}" for number in range(600)]
+    lines = [f"length=0 {number}" for number in range(300)]
     with limits():
         done = talk.run("say", "--lines", "--wait", stdin="\n".join(lines))
-        assert_within(done.seconds, 3.0, f"{len(lines)} lines")  # takes one second on an idle machine
+        assert_within(done.seconds, 1.5, f"{len(lines)} lines")  # takes half a second on an idle machine
     assert (done.code, len(done.out.split())) == (0, len(lines))
 
 
@@ -286,8 +286,7 @@ def test_an_endless_line_is_read_with_bounded_memory(scripted: Talk) -> None:
     assert len(out.split()) == 1
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
-def test_a_signal_cancels_only_the_clients_own_goals(make_talk: MakeTalk, number: signal.Signals) -> None:
+def test_a_signal_cancels_only_the_clients_own_goals(make_talk: MakeTalk) -> None:
     talk = make_talk("--max-queue", "4", scripted=True)
     other = talk.run("say", "--priority", "-1", "length=0 other").id
     talk.watcher.wait_for_terminal(other)
@@ -297,9 +296,9 @@ def test_a_signal_cancels_only_the_clients_own_goals(make_talk: MakeTalk, number
     other = talk.run("say", "length=0 other").id
     talk.watcher.wait_for_word(ids[0])
     started_at = time.monotonic()
-    code, out, err = typing.end(number)
+    code, out, err = typing.end(signal.SIGINT)
     assert time.monotonic() - started_at < 3
-    assert (code, out) == (128 + number, [])
+    assert (code, out) == (130, [])
     assert f"talk: {ids[0]}: Talk preempted: the goal was cancelled\n" in err
     assert "removed 2 waiting lines from the queue" in err
     assert [talk.watcher.wait_for_terminal(goal_id) for goal_id in ids] == ["PREEMPTED", "RECALLED", "RECALLED"]
@@ -308,7 +307,7 @@ def test_a_signal_cancels_only_the_clients_own_goals(make_talk: MakeTalk, number
     typing = Typing(talk, "say", "--lines")  # without --wait, its goals continue
     typing.type(f"{ENDLESS}\nsecond\n")
     ids = [typing.line() for _ in range(2)]
-    assert typing.end(number) == (128 + number, [], "")
+    assert typing.end(signal.SIGHUP) == (129, [], "")
     assert talk.goal(ids[1])["state"] == "PENDING"
 
 

@@ -172,7 +172,7 @@ def test_options_that_cannot_be_combined_are_refused(words: list[str], message: 
 
 
 def test_a_terminal_shows_the_text_as_it_grows(soundless: Talk) -> None:
-    code = "import sys, time\nfor text in sys.argv[1:]: print(end=text, flush=True), time.sleep(0.4)"
+    code = "import sys, time\nfor text in sys.argv[1:]: print(end=text, flush=True), time.sleep(0.2)"
     line = f'{sys.executable} -c "$CODE" "Hello. " "How are " "you?" | {" ".join(TALK)} say --stream -wf'
     terminal = Terminal(["bash", "-c", line], {**soundless.env, "CODE": code}, 80)
     try:

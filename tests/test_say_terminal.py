@@ -70,7 +70,7 @@ def test_each_word_is_highlighted_while_it_is_heard(scripted: Talk, in_terminal:
 
 def test_a_long_text_scrolls_and_is_shown_whole_at_the_end(scripted: Talk, in_terminal: Run) -> None:
     words = [f"word{number}" for number in range(60)]
-    text = " ".join(["length=1", *words])
+    text = " ".join(["length=0.6", *words])
     terminal = in_terminal("say", "-wf", "--", text, columns=50)
     assert terminal.finish() == 0
     lit: list[str] = []
@@ -79,24 +79,23 @@ def test_a_long_text_scrolls_and_is_shown_whole_at_the_end(scripted: Talk, in_te
             lit.append(screen.marked(LIT))
             assert screen.wraps == 0
     assert lit[-1] == words[-1]
-    assert set(words) & set(lit) == set(lit) - {"length=1"}  # words are never cut
+    assert set(words) & set(lit) == set(lit) - {"length=0.6"}  # words are never cut
     assert len(set(lit)) > 20
     goal_id = scripted.watcher.goals()[0]
     whole = f"{goal_id}  SUCCEEDED  {text}"
     assert "".join(line.ljust(50) for line in terminal.screen.lines).rstrip() == whole
 
 
-@pytest.mark.parametrize("columns", [5, 30])
-def test_wide_and_control_characters_do_not_break_the_line(in_terminal: Run, columns: int) -> None:
+def test_wide_and_control_characters_do_not_break_the_line(in_terminal: Run) -> None:
     text = "length=0.3 日本語の文章です a\x1b[31mred \u202egnp 👩👩👩👩 é é é の終わり\x07"
-    terminal = in_terminal("say", "-wf", "--", text, columns=columns)
+    terminal = in_terminal("say", "-wf", "--", text, columns=5)
     assert terminal.finish() == 0  # the screen fails at unknown control sequences
-    *before, _ = (screen.wraps for screen in painted(terminal, columns))
+    *before, _ = (screen.wraps for screen in painted(terminal, 5))
     assert len(before) > 3
     assert max(before) == 0
     assert terminal.screen.lines[-1] == ""
     shown = "".join(terminal.screen.lines)
-    assert "SUCCEEDED" in shown  # on two lines if the terminal is very narrow
+    assert "SUCCEEDED" in shown  # on two lines
     assert printable(text).replace(" ", "") in shown.replace(" ", "")
 
 

@@ -143,18 +143,6 @@ def test_lines_adapt_to_a_resized_window(scripted: Talk) -> None:
         scripted.run("cancel")
 
 
-def test_states_are_coloured_only_on_a_terminal(scripted: Talk) -> None:
-    for extra in ({}, {"TERM": "dumb"}):
-        with at_terminal(scripted, 80, "watch", **extra) as watch:
-            watch.wait_for("silent")
-            scripted.run("say", "length=0")
-            watch.wait_for("SUCCEEDED.*\n")
-            scripted.run("say", "fail=audio_lost")
-            watch.wait_for("ABORTED.*\n")
-            coloured = [code in watch.raw for code in (b"\x1b[32mSUCCEEDED", b"\x1b[31mABORTED", b"\x1b[")]
-        assert coloured == [not extra] * 3
-
-
 def test_a_server_that_goes_away_is_reported(scripted: Talk) -> None:
     watch = Lines(scripted)
     goal_id = scripted.run("say", "never-ends").id

@@ -17,7 +17,7 @@ ELSEWHERE = {
     "The wire": "tests/wire/test_examples.py::test_a_goal_can_be_sent_with_socat",
     "Two clients": "tests/wire/test_examples.py::test_the_shell_client_reports_each_result",
     "Two clients #2": "tests/wire/test_examples.py::test_the_plain_python_client_prints_the_words",
-    "Completion": "tests/test_completion.py::test_the_readmes_start_files_load_the_completion",
+    "Completion": "tests/test_completion.py::test_shells_complete_and_quote_ids_keys_and_options_and_show_texts",
     "Speed": "tests/test_bench.py::test_every_row_of_a_group_measures_something",
 }
 for _path in Path(__file__).parent.glob("test_*.py"):
