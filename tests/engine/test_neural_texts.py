@@ -16,7 +16,7 @@ import pytest
 
 from talkcli.engine import protocol
 from tests.engine.process import Engine
-from tests.faults.test_text_bad import ENDLESS, LONGEST_WORDS, MARKUP, RIGHT_TO_LEFT
+from tests.faults.test_text_bad import ENDLESS, MARKUP, RENDERED
 from tests.support.real_voice import REAL_VOICE
 from tests.tools.fuzz_texts import random_text
 
@@ -36,8 +36,7 @@ CHARACTER_S, TEXT_S = 2.5, 1.0
 #: Texts that are odd in various ways.
 ODD = [
     *MARKUP,
-    *LONGEST_WORDS.values(),
-    *RIGHT_TO_LEFT.values(),
+    *(text for _, text in RENDERED),
     *("\ud800 a", "a\udfff", "\ud83d", "\x00", "...", "\u0301" * 50, "a" + "\u0301" * 200, "😀" * 20),
     *("\x01s\x01100A b", "1,000,000.5", "7" * 60, "IV. XIX. 1/2 3°", "e.g. i.e. U.S.A. Dr. Mr. 5."),
     *("\ufffe\uffff", "\u202ea\u202c\u2067b\u2069"),
