@@ -194,5 +194,5 @@ class Client(ClientCalls):
         def __getattr__(self, name: str) -> Any:
             """Raise UsageError if the connection is missing, or AttributeError for any other name."""
             if name == "_connection":
-                raise UsageError("this client is not connected; use it as in: async with Client() as talk")
+                raise UsageError("this client is not connected; connect it with: async with Client() as talk")
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")

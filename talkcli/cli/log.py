@@ -57,7 +57,7 @@ def _request_goals(client: Client, count: int, filters: dict[str, Any]) -> list[
     except RequestRefused as error:
         if filters or error.code != HISTORY_FAILED:
             raise
-        note(f"{error.message}; only the goals since the start of the server are shown")
+        note(f"{error.message}; only goals since the server's start are shown")
         return client.log(count, history=False)
 
 
