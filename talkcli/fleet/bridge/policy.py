@@ -42,9 +42,9 @@ STALE_AFTER_S = ECHO_EVERY_S + 1.0
 #: Maximum number of pending goals from remote clients. The server's queue has 100 places by default. The others
 #: are left to local clients.
 MAX_REMOTE_GOALS = 20
-#: Maximum number of messages from one user per second. Further messages are dropped, so that they can't delay other
-#: users.
-MAX_MESSAGES_PER_S = 500
+#: Maximum number of messages from one user at once, and per second after that. Further messages are dropped. Otherwise,
+#: the broker's queue for the robot could become full, and the broker would drop messages of all users.
+MAX_BURST_MESSAGES, MAX_MESSAGES_PER_S = 500, 100
 #: A user can send another goal if the user has fewer pending goals than this many times the free places. This limits
 #: one user to 15 of the 20 places, so that another user finds at least 5 free.
 _PENDING_PER_FREE_PLACE = 3
@@ -135,8 +135,8 @@ class Policy:
             session: the random id of the bridge process, which is part of its tokens.
         """
         self._session = session
-        #: number of messages from each user in the current second, and the end of this second, by the `boottime` clock
-        self._message_counts, self._second_ends_at = Counter[str](), 0.0
+        #: number of each user's recent messages, and when it was last reduced, by the `boottime` clock
+        self._message_counts, self._reduced_at = Counter[str](), 0.0
         self._name = name
         self._allow = {*allow, *ALWAYS_ALLOWED}
         #: when the newest returned echo was sent, or when the connection was opened, by the `boottime` clock
@@ -166,7 +166,7 @@ class Policy:
             now: the current time, by the `boottime` clock.
         """
         if self._is_flood(message, kind, user, now):
-            return Ignored("flood", f"dropped messages of {user}: more than {MAX_MESSAGES_PER_S} in a second")
+            return Ignored("flood", f"dropped messages of {user}, who sends more than {MAX_MESSAGES_PER_S} per second")
         if message.retained:
             return Ignored("retained", f"dropped a retained message on {message.topic}, because it may be old")
         reply_topic = None
@@ -198,12 +198,14 @@ class Policy:
 
     def _is_flood(self, message: Message, kind: str, user: str, now: float) -> bool:
         """Count a message. Return True if its user has sent too many messages and it isn't a `cancel`."""
-        if now >= self._second_ends_at:
-            self._message_counts.clear()
-            self._second_ends_at = now + 1.0
-        self._message_counts[user] += 1
-        is_cancel = kind == topics.PLAIN_CANCEL or b'"cancel"' in message.payload
-        return self._message_counts[user] > MAX_MESSAGES_PER_S and not is_cancel
+        passed_s = int(now - self._reduced_at)
+        if passed_s > 0:
+            self._message_counts -= Counter(dict.fromkeys(self._message_counts, passed_s * MAX_MESSAGES_PER_S))
+            self._reduced_at += passed_s
+        if self._message_counts[user] < MAX_BURST_MESSAGES:
+            self._message_counts[user] += 1
+            return False
+        return kind != topics.PLAIN_CANCEL and b'"cancel"' not in message.payload
 
     def _check_request(self, request: Request, token: str | None, now: float) -> None:
         """Raise BadRequest if a request from the broker is not allowed, or if a `say` may be too old."""
