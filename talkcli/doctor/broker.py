@@ -368,7 +368,7 @@ def judge_login(broker: Broker, refusal: str | None) -> Finding:
     if refusal is not None:
         wrong, _, remedy = refusal.partition("; ")
         step = remedy or _LOG_STEP
-        if not remedy or "did not answer" in wrong:
+        if "did not answer" in wrong:
             if broker.tls and broker.cert is None:  # the broker disconnects at once, so the reason may be missing
                 step += "; if it requires a certificate, set TALK_MQTT_CERT and TALK_MQTT_KEY"
             elif not broker.tls:

@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 
 #: MQTT keepalive interval. The broker closes a connection if it receives nothing for one and a half intervals.
 KEEPALIVE_S = 10
-#: Time allowed for the broker to respond to a login.
-LOGIN_LIMIT_S = 5.0
+#: Time allowed for the broker to respond to a login. A desk waits for 5 s, so that it can report the reason.
+LOGIN_LIMIT_S = 4.5
 #: How often `tick` should be called.
 TICK_EVERY_S = 5.0
 #: Maximum size of a sent packet, including its header.
@@ -71,7 +71,8 @@ _NEEDED_FEATURES = (
     ("RetainAvailable", 0x9A, "retained messages"),
     ("WildcardSubscriptionAvailable", 0xA2, "wildcards in subscriptions"),
 )
-_SUITABLE_BROKER = "use a broker with MQTT 5, such as mosquitto 1.6 or later"
+_SUITABLE_BROKER = "use another broker, such as mosquitto 1.6 or later"
+_IF_NO_MQTT_5 = f"{_SUITABLE_BROKER}, if this one doesn't support MQTT 5"
 REASON_FAILURE, REASON_NOT_AUTHORIZED = 0x80, 0x87
 #: Name of the MQTT user property that contains a robot's token.
 _TOKEN_PROPERTY = "talk-token"
@@ -120,7 +121,7 @@ class Link:
                 applies, so that a flood of messages can't stop mosquitto from delivering later ones.
             on_subscribed: called for each topic with the broker's answer to the subscription.
         """
-        self._broker = broker
+        self._broker, self._has_will = broker, will is not None
         self._deliver, self._on_subscribed = on_message, on_subscribed
         #: the topics of each unanswered subscription, by message id
         self._subscribing: dict[int, tuple[str, ...]] = {}
@@ -328,17 +329,16 @@ class Link:
             which = "the certificate of this client" if self._broker.cert else "a client without a certificate"
             words = f"the broker at {url} rejected {which}: {why}"
             remedy = "set TALK_MQTT_CERT and TALK_MQTT_KEY to a certificate that it accepts"
-            return AccessDenied(f"{words}; {remedy}" if self._alert else f"{words}; {remedy}, or {_SUITABLE_BROKER}")
+            return AccessDenied(f"{words}; {remedy}" if self._alert else f"{words}; {remedy}, or {_IF_NO_MQTT_5}")
         if answer is None:
-            why = f": {self.ended}" if self.ended else f" within {LOGIN_LIMIT_S:g} s"
-            words = f"the broker at {url} did not answer{why}"
-            return ServerUnavailable(f"{words}; if it doesn't support MQTT 5, {_SUITABLE_BROKER}")
+            why = f"did not answer: {self.ended}" if self.ended else f"did not answer within {LOGIN_LIMIT_S:g} s"
+            return ServerUnavailable(f"the broker at {url} {why}; {_IF_NO_MQTT_5}")
         who = "an anonymous user" if self._broker.user is None else f"'{printable(self._broker.user)}'"
-        if is_denied(answer.value) and answer.value not in _REASONS_LOGIN_DENIED:
+        if is_denied(answer.value) and answer.value not in _REASONS_LOGIN_DENIED and self._has_will:
             # The broker rejects the topic of the will.
             words = f"the broker at {url} does not allow {who} to publish a robot's presence: {answer}"
             return AccessDenied(f"{words}; add the access rules of a robot: talk bridge --print-acl")
-        if answer.value in _REASONS_LOGIN_DENIED:
+        if is_denied(answer.value):
             words = f"the broker at {url} rejected the login of {who}: {answer}"
             return AccessDenied(f"{words}; set TALK_MQTT_USER and TALK_MQTT_PASSWORD_FILE for your login")
         if answer.value == _REASON_UNSUPPORTED_PROTOCOL:
@@ -347,7 +347,8 @@ class Link:
             missing = " and ".join(self._missing_features)
             return ProtocolMismatch(f"the broker at {url} does not support {missing}; {_SUITABLE_BROKER}")
         if answer.is_failure or self.ended:
-            return ServerUnavailable(f"the broker at {url} refused: {answer if answer.is_failure else self.ended}")
+            why = answer if answer.is_failure else self.ended
+            return ServerUnavailable(f"the broker at {url} refused the connection: {why}")
         return None
 
     def _on_connect(

@@ -54,16 +54,18 @@ def scripted_broker(first: bytes) -> Iterator[tuple[Broker, list[socket.socket]]
 @pytest.mark.parametrize(
     ("answer", "error", "words"),
     [
-        (b"", ServerUnavailable, "if it doesn't support MQTT 5, use a broker with MQTT 5"),
+        (b"", ServerUnavailable, "such as mosquitto 1.6 or later, if this one doesn't support MQTT 5"),
         (b"\x20\x02\x00\x01", ProtocolMismatch, "does not support MQTT 5"),  # the answer of MQTT 3.1.1
         (login(0x84), ProtocolMismatch, "does not support MQTT 5"),
         (login(0x9A), ProtocolMismatch, "does not support retained messages"),
         (login(0x9B), ProtocolMismatch, "does not support QoS 1"),
         (login(0, b"\x24\x00"), ProtocolMismatch, "does not support QoS 1"),
         (login(0, b"\x25\x00\x28\x00"), ProtocolMismatch, "retained messages and wildcards in subscriptions"),
-        *((login(code), AccessDenied, "rejected the login of an anonymous user") for code in (0x86, 0x87, 0x8A, 0x8C)),
-        (login(0x90), AccessDenied, "does not allow an anonymous user to publish a robot's presence"),
-        (login(0x89), ServerUnavailable, "refused: Server busy"),
+        *(
+            (login(code), AccessDenied, "rejected the login of an anonymous user")
+            for code in (0x86, 0x87, 0x8A, 0x8C, 0x90)
+        ),
+        (login(0x89), ServerUnavailable, "refused the connection: Server busy"),
     ],
 )
 def test_a_failed_login_has_an_error_with_its_likely_cause(answer: bytes, error: type[TalkError], words: str) -> None:
@@ -73,6 +75,15 @@ def test_a_failed_login_has_an_error_with_its_likely_cause(answer: bytes, error:
         Link(broker, "test", lambda _: None).open()
     assert type(caught.value) is error
     assert words in caught.value.message
+
+
+def test_a_rejected_topic_at_the_login_is_that_of_the_will() -> None:
+    from talkcli.fleet.link import Link
+
+    will = Message("talk/robot/anna/presence", b"")
+    with scripted_broker(login(0x90)) as (broker, _), pytest.raises(AccessDenied) as caught:
+        Link(broker, "test", lambda _: None, will).open()
+    assert "does not allow an anonymous user to publish a robot's presence" in caught.value.message
 
 
 @contextlib.contextmanager
