@@ -94,6 +94,8 @@ class BrokerExamination:
         #: whether the doctor logs in as the robot's bridge
         self._is_robot = environment.get(USER) == robot
         self._inbox: list[Message] = []
+        #: the topics that the broker does not allow this user to read
+        self._denied: list[str] = []
         #: the question that the report answers
         self.question = BRIDGE_QUESTION if self._is_robot else ROBOT_QUESTION
 
@@ -161,7 +163,12 @@ class BrokerExamination:
         Raises the same errors as `Link.open`.
         """
         name = f"talk-doctor-{os.urandom(8).hex()}"
-        link = Link(broker, name, self._inbox.append, receive_maximum=MAX_RECEIVE_COUNT)
+
+        def on_subscribed(topic: str, code: int) -> None:
+            if is_denied(code):
+                self._denied.append(topic)
+
+        link = Link(broker, name, self._inbox.append, receive_maximum=MAX_RECEIVE_COUNT, on_subscribed=on_subscribed)
         try:
             self._run_limited(link.open)
         except TimeoutError as error:
@@ -192,6 +199,8 @@ class BrokerExamination:
         if self._is_robot:
             echo = robot(topics.ECHO)
             others = [robot(topics.STATUS), robot(topics.EVENT, "doctor"), replies(self._robot)]
+            # Requests that arrive are ignored, because the robot's bridge gets them, too.
+            link.subscribe(*(robot(each, topics.ANY) for each in topics.REQUEST_LEVELS), retained=False)
         else:
             echo, others = replies(topics.MARKER), [robot(topics.REQUEST, user)]
         codes, presences = dict[str, int](), dict[str, Presence]()
@@ -221,8 +230,8 @@ class BrokerExamination:
         unwritable = tuple(each for each in tested if is_denied(codes.get(each, 0)))
         missing = [each for each in tested if each not in codes]
         trouble = link.ended or (f"the broker did not acknowledge a message to {missing[0]}" if missing else None)
-        unreadable = () if is_back or echo in unwritable else (echo,)
-        return judge_rights(user, unwritable, unreadable, trouble), presences
+        unreadable = dict.fromkeys(self._denied if is_back or echo in unwritable else (*self._denied, echo))
+        return judge_rights(user, unwritable, tuple(unreadable), trouble), presences
 
     def _check_robot_server(self, broker: Broker) -> Finding:
         """Request the status of the robot's server. Return the finding."""
@@ -426,7 +435,7 @@ def judge_rights(user: str, unwritable: tuple[str, ...], unreadable: tuple[str, 
     Args:
         user: the user's name.
         unwritable: topics to which the user must not publish.
-        unreadable: topics that the user can't read, because no message came back.
+        unreadable: topics that the user can't read, because the broker said so, or because no message came back.
         error: why the rights could not be tested, or None if they could.
     """
     parts = [f"write to {' and '.join(unwritable)}"] if unwritable else []

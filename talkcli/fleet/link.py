@@ -301,6 +301,7 @@ class Link:
             logged_in = self._answer is not None and not self._answer.is_failure
             if self.ended is None and self._socket is not None and logged_in and not self._unacknowledged:
                 self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER_DELIVER)
+                self._paho.on_disconnect = None
                 self._paho.disconnect()
                 self.write()
             self.ended = self.ended or "the connection was closed"
@@ -347,8 +348,8 @@ class Link:
             missing = " and ".join(self._missing_features)
             return ProtocolMismatch(f"the broker at {url} does not support {missing}; {_SUITABLE_BROKER}")
         if answer.is_failure or self.ended:
-            why = answer if answer.is_failure else self.ended
-            return ServerUnavailable(f"the broker at {url} refused the connection: {why}")
+            reason = str(answer) if answer.is_failure else self.ended
+            return ServerUnavailable(f"the broker at {url} refused the connection: {reason}")
         return None
 
     def _on_connect(

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import glob
+import hashlib
+import json
 import os
+from base64 import b64encode
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -15,9 +19,11 @@ from tests.support.bridge import Desk, desk
 from tests.support.broker import Broker
 from tests.support.certificates import authority, stranger
 from tests.support.mqtt import Listener
-from tests.support.surroundings import command_line
+from tests.support.surroundings import command_line, needs
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from tests.conftest import MakeTalk
     from tests.fleet.conftest import MakeBridge
 
@@ -173,3 +179,32 @@ def test_a_bridge_with_the_login_of_another_robot_reports_missing_rights(
         bridge.await_log("talk bridge --print-acl", within=30)
         assert bridge.running
         assert olga.messages == []
+
+
+def test_a_robot_or_a_desk_that_may_not_read_its_topics_says_so_at_once(
+    tmp_path: Path, make_talk: MakeTalk, make_bridge: MakeBridge
+) -> None:
+    """mosquitto's plugin refuses subscriptions. With an `acl_file`, it accepts them, and then sends no messages."""
+    plugin = next(iter(glob.glob("/usr/lib/*/mosquitto_dynamic_security.so")), None)
+    if plugin is None:
+        needs("mosquitto_dynamic_security.so")
+    hashed = hashlib.pbkdf2_hmac("sha512", SECRET.encode(), b"twelve bytes", 1)
+    password = {"password": b64encode(hashed).decode(), "salt": b64encode(b"twelve bytes").decode(), "iterations": 1}
+    denied = ("talk/robot/anna/request/+", "talk/reply/#")
+    rules = [{"acltype": "subscribePattern", "topic": topic, "allow": False} for topic in denied]
+    rights = {
+        "defaultACLAccess": dict.fromkeys(("publishClientSend", "publishClientReceive", "subscribe"), True),
+        "roles": [{"rolename": "limited", "acls": rules}],
+        "clients": [{"username": "anna", "roles": [{"rolename": "limited"}], **password}],
+    }
+    (tmp_path / "rights").write_text(json.dumps(rights), encoding="ascii")
+    with Broker(settings=[f"plugin {plugin}", f"plugin_opt_config_file {tmp_path}/rights"]) as broker:
+        bridge = make_bridge(make_talk(scripted=True), broker, "anna", online=False, user="anna", password=SECRET)
+        bridge.await_log("does not allow this robot to read talk/robot/anna/request/+ (reason 0x87)")
+        bridge.await_log("disconnected from the broker: the connection was closed")
+        assert "online at" not in bridge.log
+        with Desk(broker, user="anna", password=SECRET) as operator:
+            done = operator.run("--robot", "bert", "status")
+            assert (done.code, "to read talk/reply/anna/+/_;" in done.err) == (10, True), done
+            done = operator.run("--robot", "anna", "doctor")
+            assert "to read talk/robot/anna/request/+" in done.out, done
