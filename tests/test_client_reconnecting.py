@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import json
 import socket
 import subprocess
 import sys
-import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import pytest
 
-from talkcli import Client, Result, Snapshot, State, StateChanged
+from talkcli import Client, Result, Snapshot, State
 from talkcli.client.core import MAX_UNSENT_BYTES
 from talkcli.errors import Lost, ServerUnavailable, TalkError, UnknownGoal, UsageError
 from tests.support.connection import PATIENCE
@@ -192,42 +190,6 @@ def test_a_restart_loses_all_goals_and_the_client_uses_the_new_server(client: Cl
     assert client.server_pid == scripted.pid
 
 
-def test_goals_are_followed_again_after_a_reconnect_to_the_same_server(client: Client, scripted: Talk) -> None:
-    active = client.say("length=0.6 one two", feedback=True)
-    pending, ending = client.say("length=0"), client.say("length=0", priority=1)
-    with Client(scripted.socket) as other:
-        scripted.watcher.wait_for_word(active.id)
-        disconnect(client)
-        other.cancel([ending.id])
-        assert [handle.state for handle in (pending, ending)] == [State.PENDING] * 2
-        assert client.status().active
-        events = poll_until(active, ended)
-        states = [event.state for event in events if isinstance(event, StateChanged)]
-        assert states == [*dict.fromkeys(states)]
-        assert states[-1] is State.SUCCEEDED
-        assert (ending.wait(PATIENCE).state, pending.wait(PATIENCE).state) == (State.RECALLED, State.SUCCEEDED)
-
-
-def test_a_watch_continues_after_a_reconnect_with_a_new_snapshot(client: Client, scripted: Talk) -> None:
-    watch = client.events(reconnect=True)
-    assert isinstance(next(watch), Snapshot)
-    disconnect(client)
-    assert isinstance(next(watch), Snapshot)
-    client.say("length=0", follow=False)
-    assert isinstance(next(watch), StateChanged)
-    seen: list[Event] = []
-    taking = threading.Thread(
-        target=lambda: seen.extend(itertools.takewhile(lambda event: lacks_word(event, "hello"), watch))
-    )
-    taking.start()
-    restart(scripted)
-    # The client may reconnect up to 0.5 s later, and must still see the end of this goal.
-    scripted.request("say", text="length=0.8 hello")
-    taking.join(PATIENCE)
-    assert not taking.is_alive()
-    assert Snapshot in {type(event) for event in seen}
-
-
 def test_watching_threads_survive_a_server_outage(client: Client, scripted: Talk) -> None:
     """One of the threads tries to connect. The others wait for it without a limit."""
     watches = [client.events(reconnect=True) for _ in range(3)]
@@ -239,11 +201,6 @@ def test_watching_threads_survive_a_server_outage(client: Client, scripted: Talk
         time.sleep(0.3)
         scripted.start_server()
         assert {type(future.result(PATIENCE)) for future in futures} == {Snapshot}
-
-
-def lacks_word(event: Event, word: str) -> bool:
-    """Return whether an event contains no goal with this word in its text."""
-    return not (isinstance(event, StateChanged) and event.goal and word in (event.goal.text or ""))
 
 
 def test_calls_fail_at_once_while_no_server_runs(client: Client, scripted: Talk) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import select
 import threading
@@ -17,7 +16,7 @@ from talkcli.client.connection import SocketConnection
 from talkcli.errors import Lost, ServerUnavailable, UnknownGoal
 from talkcli.goals.states import State
 from talkcli.polling import Interrupted, run_blocking
-from talkcli.protocol.events import Event, Result, Snapshot, StateChanged, WordHeard
+from talkcli.protocol.events import Event, Result, StateChanged, WordHeard
 from talkcli.protocol.lines import MAX_LINE_BYTES
 from tests.support.connection import PATIENCE
 from tests.support.scripted_peer import OVERVIEW, Peer, goal, result, serving
@@ -56,23 +55,6 @@ def test_a_silent_server_is_considered_lost(monkeypatch: pytest.MonkeyPatch) -> 
         assert 0.3 <= time.monotonic() - started_at < 1
         with pytest.raises(ServerUnavailable, match="nothing was sent"):
             client.status()
-
-
-def test_a_watch_lasts_while_the_server_is_alive(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("talkcli.client.core.SILENCE_LIMIT_S", 0.4)
-
-    def play(peer: Peer) -> None:
-        peer.reply("watch", **OVERVIEW)
-        for _ in range(5):
-            time.sleep(0.1)
-            peer.send({"event": "alive"})
-        peer.send(peer.state("ACTIVE"))
-
-    with serving(play) as path, Client(path) as client:
-        snapshot, state = itertools.islice(watch := client.events(), 2)
-        assert (type(snapshot), type(state)) == (Snapshot, StateChanged)
-        with pytest.raises(Lost, match=r"nothing for 0\.4 s"):
-            next(watch)
 
 
 def test_feedback_times_out_even_while_words_arrive() -> None:

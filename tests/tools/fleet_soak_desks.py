@@ -1,14 +1,14 @@
-"""The desks of the fleet's soak test: some use the library, some use the command."""
+"""The desks of the fleet's soak test, which use the library."""
 
 from __future__ import annotations
 
 import itertools
-import json
 import random
 import threading
 import time
 from collections import Counter, deque
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from talkcli import Client
@@ -17,7 +17,6 @@ from talkcli.fleet.broker import from_environment
 from talkcli.fleet.desk.robot import RobotConnection
 from talkcli.polling import run_blocking
 from talkcli.protocol.events import Result
-from tests.support.bridge import Desk
 from tests.tools.soak_clients import PATIENCE_S, Workers
 
 if TYPE_CHECKING:
@@ -28,10 +27,10 @@ if TYPE_CHECKING:
     from tests.support.broker import Broker
 
 RATE = 450
+_DESKS = 6
 #: Ends of goals that weren't sent, or that the robot refused.
 UNSENT, REFUSED = "UNSENT", "REFUSED"
 UNSPOKEN = frozenset({UNSENT, REFUSED, "REJECTED", "RECALLED"})
-_END_BY_EXIT_CODE = {0: "SUCCEEDED", 3: UNSENT, 4: "ABORTED", 5: "REJECTED", 6: "RECALLED", 7: "PREEMPTED", 12: "LOST"}
 #: Time until a desk that found no robot tries again, and time between two pieces of a growing text.
 _RETRY_S, _INTERVAL_S = 0.3, 0.2
 _OPTIONS: tuple[dict[str, Any], ...] = (
@@ -41,7 +40,6 @@ _OPTIONS: tuple[dict[str, Any], ...] = (
     *({"preempt": True, "ttl": 1.0}, {"ttl": 2.0}, {"ttl": 8.0}, {"key": "one"}, {"patient": True}, {"feedback": True}),
     *({"stall": 1.0}, {"stall": 5.0}, {"stall": 5.0, "preempt": True}, {"stall": 60.0, "ttl": 8.0}),  # growing texts
 )
-_COMMAND_OPTIONS: tuple[tuple[str, ...], ...] = ((), (), ("--preempt",), ("--priority", "1"), ("--feedback",))
 
 
 @dataclass(slots=True)
@@ -51,7 +49,6 @@ class Sent:
     id: str
     text: str
     ttl: float | None
-    once: bool = True
     sent_at: list[float] = field(default_factory=lambda: [time.time()])
     ends: list[tuple[str, float]] = field(default_factory=list)  # end and time, as the desks received them
 
@@ -85,15 +82,11 @@ class Desks:
     def __init__(self, robot: str, broker: Broker, ledger: Ledger, seed: str) -> None:
         self._robot, self._broker, self._ledger = robot, broker, ledger
         self.workers = Workers()
-        kinds = [("library", self._use_library)] * 4 + [("command", self._use_command)] * 2
-        for number, (kind, use) in enumerate(kinds):
-            name = f"{kind}-{number}"
-            rng = random.Random(f"{seed} {name}")
-            self.workers.start(name, lambda over, use=use, name=name, rng=rng: use(name, rng, over))  # type: ignore[misc]
+        for number in range(_DESKS):
+            name = f"desk-{number}"
+            self.workers.start(name, partial(self._work, name, random.Random(f"{seed} {name}")))
 
-    # -- the library
-
-    def _use_library(self, name: str, rng: random.Random, over: threading.Event) -> None:
+    def _work(self, name: str, rng: random.Random, over: threading.Event) -> None:
         earlier: deque[Sent] = deque(maxlen=10)
         for client, connection in self._connections(name, over):
             for _ in range(rng.randrange(1, 12)):
@@ -129,7 +122,6 @@ class Desks:
         return self._send(client, self._ledger.new(options.get("ttl")), options)
 
     def _say_again(self, client: Client, goal: Sent) -> tuple[Sent, GoalHandle] | None:
-        goal.once = False
         goal.sent_at.append(time.time())
         return self._send(client, goal, {"ttl": goal.ttl})
 
@@ -166,33 +158,3 @@ class Desks:
             assert isinstance(last, Result), f"{handle.id}: the last event is {last}"
             assert not any(isinstance(event, Result) for event in before), f"{handle.id} has two results: {before}"
             self._ledger.end(goal, last.goal.state.name)
-
-    # -- the command
-
-    def _use_command(self, name: str, rng: random.Random, over: threading.Event) -> None:
-        with Desk(self._broker, user=name, password=False, env={"TALK_ROBOT": self._robot}) as desk:
-            while not over.is_set():
-                goal = self._ledger.new()
-                options = ("--id", goal.id, "--rate", str(RATE), *rng.choice(_COMMAND_OPTIONS))
-                command = desk.start("--json", "say", "--wait", *options, "--", goal.text)
-                if rng.random() < 0.2:  # kill it while it starts or waits
-                    over.wait(rng.uniform(0.1, 1.0))
-                    command.kill()
-                    command.communicate()
-                    continue
-                done = desk.finish(command, timeout=PATIENCE_S)
-                assert done.code in _END_BY_EXIT_CODE, done
-                end = _END_BY_EXIT_CODE[done.code]
-                self._ledger.end(goal, end)
-                assert end in (UNSENT, "LOST") or _printed_ends(done.out) == [end], done
-                if end == UNSENT:
-                    over.wait(_RETRY_S)
-                if rng.random() < 0.05:
-                    done = desk.run("cancel", timeout=PATIENCE_S)
-                    assert done.code in (0, 3, 12), done
-
-
-def _printed_ends(out: str) -> list[str]:
-    """Return the end states that a command has printed, with or without feedback before them."""
-    objects = [json.loads(line) for line in out.splitlines()]
-    return [item.get("goal", item)["state"] for item in objects if item.get("event", "result") == "result"]

@@ -1,18 +1,15 @@
 """The faults of the fleet's soak test, and the check of its goals.
 
-The check compares the ends that the desks received with what the robot spoke, and with the results at the broker.
+The check compares the ends that the desks received with what the robot spoke.
 """
 
 from __future__ import annotations
 
-import json
-import threading
 import time
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-from tests.support.mqtt import Listener
 from tests.tools.fleet_soak_desks import UNSPOKEN
 from tests.tools.soak_faults import FaultInjector
 
@@ -42,7 +39,6 @@ _STALE_S = 6.0
 class Outages:
     """The times at which each process was killed (Unix times)."""
 
-    broker: list[float] = field(default_factory=list)
     server: list[float] = field(default_factory=list)
     bridge: list[float] = field(default_factory=list)
 
@@ -52,52 +48,11 @@ class Outages:
         bridges = [killed for killed in self.bridge if sent < killed < second]
         return any(bridge > server - _RELOAD_S for server in servers for bridge in bridges)
 
-    def excuse_lost(self, reached: float, ended: float) -> bool:
-        """Whether a desk may miss a result, because the broker that had it and its server were both killed."""
-        broker_killed = any(reached - _DELAY_S < killed < reached + _DELAY_S for killed in self.broker)
-        return broker_killed and any(reached - _DELAY_S < killed < ended for killed in self.server)
-
-
-class ReplyRecorder:
-    """Receives all of the robot's replies from the broker, with a new connection after each restart."""
-
-    def __init__(self, broker: Broker) -> None:
-        self._broker = broker
-        self._lock = threading.Lock()
-        self._results: dict[str, float] = {}
-        self._seen = 0
-        self._listener: Listener | None = None
-        self.listen()
-
-    def listen(self) -> None:
-        self._listener, self._seen = Listener(self._broker, "talk/reply/#"), 0
-
-    def close(self) -> None:
-        if self._listener:
-            self._listener.close()
-        self.results()
-        self._listener = None
-
-    def results(self) -> dict[str, float]:
-        """Return the Unix time at which the broker received the first result of each goal."""
-        with self._lock:
-            messages = self._listener.messages[self._seen :] if self._listener else []
-            self._seen += len(messages)
-            clock = time.time() - time.monotonic()
-            for message in messages:
-                for line in message.payload.splitlines():
-                    if b'"result"' in line and (event := json.loads(line)).get("event") == "result":
-                        self._results.setdefault(event["goal"]["id"], message.arrived + clock)
-            return dict(self._results)
-
 
 class FleetFaults(FaultInjector):
-    def __init__(
-        self, rng: random.Random, talk: Talk, broker: Broker, bridge: Bridge, proxy: Proxy, replies: ReplyRecorder
-    ) -> None:
+    def __init__(self, rng: random.Random, talk: Talk, broker: Broker, bridge: Bridge, proxy: Proxy) -> None:
         super().__init__(rng)
         self._talk, self._broker, self._bridge, self._proxy = talk, broker, bridge, proxy
-        self._replies = replies
         self.outages = Outages()
         kinds = (
             self.broker_killed,
@@ -109,12 +64,9 @@ class FleetFaults(FaultInjector):
         self.kinds = {kind.__name__: kind for kind in (*kinds, proxy.cut)}
 
     def broker_killed(self) -> None:
-        self.outages.broker.append(time.time())
         self._broker.kill()
-        self._replies.close()
         time.sleep(self.rng.uniform(*_AWAY_S))
         self._broker.start()
-        self._replies.listen()
 
     def bridge_killed(self) -> None:
         self.outages.bridge.append(time.time())
@@ -139,9 +91,8 @@ class FleetFaults(FaultInjector):
         self._proxy.release()
 
 
-def check_goals(ledger: Ledger, monitor: GoalMonitor, replies: ReplyRecorder, outages: Outages) -> None:
+def check_goals(ledger: Ledger, monitor: GoalMonitor, outages: Outages) -> None:
     """Assert that all goals so far were spoken and ended correctly."""
-    results = replies.results()
     now = time.time()
     for goal in list(ledger.goals):
         starts = monitor.starts(goal.text)
@@ -156,9 +107,3 @@ def check_goals(ledger: Ledger, monitor: GoalMonitor, replies: ReplyRecorder, ou
         unspoken = known and known <= UNSPOKEN and all_known
         assert not (starts and unspoken), f"spoken, but reported as not spoken: {details}"
         assert starts or not known & {"SUCCEEDED", "PREEMPTED"}, f"not spoken, but reported as spoken: {details}"
-        reached = results.get(goal.id)
-        for end, at in goal.ends if goal.once else ():
-            lost = end == "LOST" and reached is not None and reached < at - _DELAY_S
-            assert not lost or outages.excuse_lost(results[goal.id], at), (
-                f"LOST, but the broker had its result: {details}"
-            )

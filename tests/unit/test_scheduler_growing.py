@@ -12,8 +12,6 @@ from tests.unit.robot import play, rules
 
 RULES = """
 # a text that is complete
-is spoken like any other
-    a more; append a text=bc; append a text=d end; completed a -> a SUCCEEDED
 may grow while the goal waits
     a; b more; append b text=c end; completed a; completed b -> a b SUCCEEDED
 lets the next goal start only at its end
@@ -48,8 +46,6 @@ is stopped by force if it doesn't become silent
 # a sender that leaves
 breaks off a waiting goal at once
     a; b more; left b -> a ACTIVE; b RECALLED broken_off
-lets what was complete be spoken
-    a more; left a -> a ACTIVE
 ends the goal as broken off then
     a more; left a; completed a -> a ABORTED broken_off
 changes nothing once the text is complete

@@ -14,8 +14,6 @@ RULES = """
 # an interjection
 is an ordinary goal if nothing is spoken
     a interject -> a ACTIVE
-interrupts the active goal at the end of its word
-    a; b interject -> a ACTIVE; b PENDING
 is spoken once the goal has reached the end of its word
     a; b; c interject; interrupted a -> c ACTIVE; a ACTIVE paused for c; b PENDING
 interrupts a sound, too

@@ -38,11 +38,9 @@ GROUPS: dict[str, Callable[[Harness], list[Row]]] = {
     "commands": processes.commands,
     "idle": processes.idle,
     "throughput": load.throughput,
-    "crowd": load.crowd,
 }
 #: Groups that are only measured if they are named.
 NAMED: dict[str, Callable[[Harness], list[Row]]] = {
-    "neural": sound.neural,
     "fleet": fleet.fleet,
 }
 
@@ -57,7 +55,7 @@ def measure(name: str, harness: Harness) -> list[Row]:
 
 def main() -> None:
     parser = argparse.ArgumentParser("python -m tests.tools.bench", description=_ABOUT)
-    names = f"{', '.join(GROUPS)}; {', '.join(NAMED)} (the last two only if they are named)"
+    names = f"{', '.join(GROUPS)}; {', '.join(NAMED)} (the last one only if it is named)"
     parser.add_argument("rows", nargs="*", metavar="ROW", help=names)
     parser.add_argument("--rounds", type=int, default=15, help="rounds of each row; some rows have more (%(default)s)")
     parser.add_argument(

@@ -14,14 +14,9 @@ import numpy as np
 from talkcli import Client, State
 from tests.support.compare import extent
 from tests.support.espeak import RATE
-from tests.support.neural_server import await_voice
-from tests.support.real_voice import REAL_VOICE
 from tests.support.recording import LOUD
 from tests.support.reference import render
-from tests.support.surroundings import short_directory
-from tests.support.usage import descendants
 from tests.tools.bench.harness import PYTHON, SHORT, TALK, VOICED, serving
-from tests.tools.bench.machine import megabytes
 from tests.tools.bench.table import Limit, Row
 
 if TYPE_CHECKING:
@@ -42,17 +37,6 @@ _PAUSE_SAMPLES = RATE * 150 // 1000
 LONG_TEXT = ("I am ready to go. We are leaving now. Please follow me. " * 200)[:10_000]
 #: The first words of the long text.
 _TEN = "I am ready"
-_THIRTY = (
-    "I have found the small red box on the table in the kitchen and will bring it to you now, "
-    "please keep the door open and wait for me there"
-)
-#: Milliseconds by which a neural voice may start later than espeak-ng's.
-_NEURAL_LATER_MS = {TEXT: 110, _THIRTY: 260}
-#: An id, because "en" would select the neural voice.
-_ESPEAK = "gmw/en"
-#: Memory limits for the engine process, with a neural voice and after long texts.
-_LOADED_MB, _AFTER_TEXTS_MB = 260, 340
-_TEXTS, _LONG_TEXT_LIMIT_S = 10, 600.0
 
 
 def onset(harness: Harness) -> list[Row]:
@@ -175,33 +159,10 @@ def gap(harness: Harness) -> list[Row]:
 
 def long_text(harness: Harness) -> list[Row]:
     """Measure the onset of a long text, compared with a short text."""
-    subjects = {text: partial(_say_and_cancel, harness.client, text, None) for text in (_TEN, LONG_TEXT)}
+    subjects = {text: partial(_say_and_cancel, harness.client, text) for text in (_TEN, LONG_TEXT)}
     times = harness.in_turn({text: partial(harness.until_sound, action) for text, action in subjects.items()})
     name = "`Client.say()` of 10,000 characters → first sample"
     return [Row(name, "ms", times[LONG_TEXT], "10 characters", times[_TEN], (Limit("ratio", 1.3),))]
-
-
-def neural(harness: Harness) -> list[Row]:
-    """Measure the onset of a neural voice, compared with espeak-ng's, and the memory of the engine process."""
-    rows = []
-    with serving("--voice", REAL_VOICE, sink=harness.sink) as talk, Client(talk.socket) as client:
-        await_voice(talk.socket, REAL_VOICE)
-        for text, limit_ms in _NEURAL_LATER_MS.items():
-            say = {voice: partial(_say_and_cancel, client, text, voice) for voice in (REAL_VOICE, _ESPEAK)}
-            times = harness.in_turn({voice: partial(harness.until_sound, action) for voice, action in say.items()})
-            name = f"`Client.say()` of {len(text.split())} words → first sample, joe"
-            rows.append(Row(name, "ms", times[REAL_VOICE], "espeak", times[_ESPEAK], (Limit("above", limit_ms),)))
-    with short_directory() as place, serving("--voice", REAL_VOICE, "--player", f"file:{place}/x.wav") as talk:
-        await_voice(talk.socket, REAL_VOICE)
-        (engine,) = descendants(talk.pid)
-        name, limit = "memory of the engine process with joe (Pss)", Limit("median", _LOADED_MB)
-        rows.append(Row(name, "MB", [megabytes(engine)], limits=(limit,)))
-        with Client(talk.socket) as client:
-            for _ in range(_TEXTS):
-                assert client.say(LONG_TEXT).wait(_LONG_TEXT_LIMIT_S).state is State.SUCCEEDED
-        name, limit = f"… after {_TEXTS} texts of {len(LONG_TEXT):,} characters", Limit("median", _AFTER_TEXTS_MB)
-        rows.append(Row(name, "MB", [megabytes(engine)], limits=(limit,)))
-    return rows
 
 
 def silences(samples: Samples, shortest: int, level: int = LOUD) -> list[tuple[int, int]]:
@@ -223,14 +184,8 @@ def _say_whole(client: Client, text: str) -> Callable[[], object]:
     return end
 
 
-def _say_and_cancel(client: Client, text: str, voice: str | None) -> Callable[[], object]:
-    goal = client.say(text, voice=voice)
-
-    def end() -> None:
-        spoken = goal.cancel().voice
-        assert voice in (None, spoken), f"{spoken} was heard instead of {voice}"
-
-    return end
+def _say_and_cancel(client: Client, text: str) -> Callable[[], object]:
+    return client.say(text).cancel
 
 
 def _cancel_returns(harness: Harness, sound_server: str) -> float:
