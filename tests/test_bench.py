@@ -40,7 +40,6 @@ def test_every_row_of_a_group_measures_something(harness: Harness, group: str, m
         needs_packages("paho")
     for module, name, smaller in (
         (load, "GOALS", 200),
-        (growing, "TOKENS", 100),
         *((module, "_MORE_ROUNDS", 1) for module in (fleet, growing, processes, sound)),
         (sound, "LONG_TEXT", sound.LONG_TEXT[:50]),
     ):

@@ -58,9 +58,9 @@ class Peer:
     def send(self, *messages: dict[str, Any]) -> None:
         self._socket.sendall(b"".join(json.dumps(message).encode() + b"\n" for message in messages))
 
-    def accept(self, *, state: str = "PENDING") -> None:
+    def accept(self) -> None:
         """Accept the next goal with the id `g`."""
-        self.reply("say", goal=goal(state))
+        self.reply("say", goal=goal("PENDING"))
 
     def reply(self, kind: str, **fields: object) -> None:
         self.send({"seq": self.receive(kind)["seq"], "ok": True, **fields})

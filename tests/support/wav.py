@@ -16,9 +16,9 @@ _GUID_END = bytes.fromhex("000000001000800000aa00389b71")
 Floats = npt.NDArray[np.float64]
 
 
-def tone(seconds: float, rate: int, hertz: float = 1_000) -> Floats:
-    """Return the samples of a cosine, which begins and ends loud."""
-    return np.cos(2 * np.pi * hertz * np.arange(int(seconds * rate)) / rate) / 2
+def tone(seconds: float, rate: int) -> Floats:
+    """Return the samples of a cosine of 1,000 Hz, which begins and ends loud."""
+    return np.cos(2 * np.pi * 1_000 * np.arange(int(seconds * rate)) / rate) / 2
 
 
 def pitch(samples: npt.NDArray[np.int16], rate: int) -> float:

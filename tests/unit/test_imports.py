@@ -221,34 +221,6 @@ def test_a_library_is_imported_only_where_it_is_allowed(library: str) -> None:
     assert {part(module) for module in naming} <= ALLOWED[library]
 
 
-def test_only_the_server_gets_its_path_from_platformdirs() -> None:
-    imported = [found for module in sources() for found in imports(module) if found.name.startswith("platformdirs")]
-    assert {found.function for found in imported} == {"server_socket"}
-    for module, tree in sources().items():
-        if part(module) not in {"server", "paths"}:
-            assert "server_socket" not in {getattr(node, "attr", "") for node in ast.walk(tree)}, module
-
-
-#: Modules of the commands and doctor that only fleets need. Other modules import them inside functions.
-FLEET_ONLY = {"cli.fleet", "cli.several", "doctor.broker"}
-
-
-def test_server_doctor_and_fleet_are_imported_only_when_needed() -> None:
-    for module in sources():
-        for name, imported in inside(module):
-            where = f"talkcli.{module}:{imported.line} imports {name}"
-            if part(name) == "server" and part(module) != "server" and not imported.typing:
-                assert module == "cli.services", where
-            if part(name) == "doctor" and part(module) != "doctor":
-                assert module == "cli.ask", where
-                assert imported.function or imported.typing, f"{where}, which slows down the other commands"
-            if part(module) == "fleet":
-                assert part(name) not in {"server", "engine"}, where
-            elif part(name) == "fleet" or name in FLEET_ONLY:
-                assert part(module) in {"", "cli", "doctor", "aio"}, where
-                assert imported.function or imported.typing or module in FLEET_ONLY, where
-
-
 def test_only_the_engine_imports_its_child_modules() -> None:
     """Other packages may use the modules directly in `engine`, and `engine.parent`."""
     for module in sources():

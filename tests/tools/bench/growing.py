@@ -1,4 +1,4 @@
-"""Rows about growing texts: first sound, additions, silence and memory."""
+"""Rows about growing texts: first sound, additions and silence."""
 
 from __future__ import annotations
 
@@ -7,10 +7,8 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING
 
-from tests.support import usage
 from tests.support.connection import Wire
-from tests.support.surroundings import short_directory
-from tests.tools.bench.harness import VOICED, serving
+from tests.tools.bench.harness import VOICED
 from tests.tools.bench.table import Limit, Row
 
 if TYPE_CHECKING:
@@ -22,8 +20,6 @@ if TYPE_CHECKING:
 _SENTENCE, _STOP, _NEXT = ("I", " found", " the", " charger"), ".", " It"
 #: Seconds between two tokens, and seconds in which nothing follows.
 _INTERVAL_S, _NOTHING_S = 0.03, 0.5
-#: As many tokens as the longest text may have, and one of them.
-TOKENS, _TOKEN = 10_000, "word "
 _MORE_ROUNDS = 2
 _PATIENCE_S = 120.0
 
@@ -37,13 +33,12 @@ def growing(harness: Harness) -> list[Row]:
         additions = [1000 * each for each in sender.seconds]
         times |= harness.in_turn(silences, harness.options.rounds * _MORE_ROUNDS)
     end = "last token of a growing text's first sentence"
-    limits = {bound: [Limit("median", bound)] for bound in (2, 4, 45, 115)}
+    limits = {bound: [Limit("median", bound)] for bound in (2, 45, 115)}
     return [
         Row(f"{end} → first sample, if the next one follows after 30 ms", "ms", times[_NEXT], limits=limits[45]),
         Row(f"{end} → first sample, if nothing follows", "ms", times[""], limits=limits[115]),
         Row("`append` of a token → reply", "ms", additions, limits=limits[2]),
         Row("cancel of a growing text → silence", "ms", times["growing"], "whole text", times["whole"], limits[2]),
-        Row(f"memory of {TOKENS:,} tokens, in the server and its engine", "MB", [_memory()], limits=limits[4]),
     ]
 
 
@@ -98,19 +93,3 @@ def _silence(harness: Harness, sender: _Sender, *, more: bool) -> float:
         return int
 
     return harness.until_silence(say, stop)
-
-
-def _memory() -> float:
-    """Return how many megabytes more a server and its engine use after the longest text."""
-    with contextlib.ExitStack() as stack:
-        file = f"file:{stack.enter_context(short_directory())}/spoken.wav"
-        talk = stack.enter_context(serving("--player", file, "--rate", "450"))
-        sender = stack.enter_context(contextlib.closing(_Sender(talk.socket)))
-        for count in (2, TOKENS):
-            before = usage.count(talk.pid).memory
-            goal = sender.say(_TOKEN)
-            for _ in range(count - 1):
-                sender.append(goal, _TOKEN)
-            sender.append(goal, end=True)
-            sender.finish(goal)
-        return (usage.count(talk.pid).memory - before) / 1024

@@ -165,9 +165,9 @@ def long_text(harness: Harness) -> list[Row]:
     return [Row(name, "ms", times[LONG_TEXT], "10 characters", times[_TEN], (Limit("ratio", 1.3),))]
 
 
-def silences(samples: Samples, shortest: int, level: int = LOUD) -> list[tuple[int, int]]:
+def silences(samples: Samples, shortest: int) -> list[tuple[int, int]]:
     """Return the start and end of each silence between two sounds that has more than `shortest` samples."""
-    loud = np.flatnonzero(np.abs(samples.astype(np.int32)) > level)
+    loud = np.flatnonzero(np.abs(samples.astype(np.int32)) > LOUD)
     return [(int(loud[index]) + 1, int(loud[index + 1])) for index in np.flatnonzero(np.diff(loud) > shortest)]
 
 
