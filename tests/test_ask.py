@@ -160,15 +160,6 @@ def test_set_changes_only_this_setting(shared: Talk, options: list[str], name: s
     assert {setting: described[setting] for setting in changed} == changed
 
 
-def test_the_printed_settings_can_be_used_as_options(shared: Talk) -> None:
-    shared.run("set", "--rate", "150", "--volume", str(0.1 + 0.2), "--ttl", "1.5", "--pitch", "60", "--voice", "en")
-    assert "volume 0.3, " in shared.log
-    before = settings(shared)
-    options = [part for name, value in before.items() if name != "preempt" for part in (f"--{name}", value)]
-    assert shared.run("set", *options).code == 0
-    assert settings(shared) == before
-
-
 def test_an_invalid_value_changes_no_setting(shared: Talk) -> None:
     for arguments in (["--rate", "79"], ["--volume", "nan"], ["--ttl", "inf"], ["--voice", ""], ["60"]):
         done = shared.run("set", "--pitch", "60", *arguments)

@@ -205,14 +205,15 @@ def test_a_client_yields_the_processor_and_loses_no_reply(monkeypatch: pytest.Mo
 
 
 def test_simple_commands_import_neither_click_nor_slow_modules(scripted: Talk) -> None:
-    heavy = ["click", "asyncio", "pyttsx3", "platformdirs", "ssl"]
-    heavy += ["talkcli.server", "talkcli.goals.scheduler", "talkcli.engine"]
+    heavy = ["click", "asyncio", "concurrent", "multiprocessing", "ssl", "logging", "tempfile", "dataclasses"]
+    heavy += ["pathlib", "pyttsx3", "platformdirs", "talkcli.server", "talkcli.goals.scheduler", "talkcli.engine"]
     code = (
         "import sys; from talkcli.cli import run\n"
         "for arguments in {}: assert run(arguments) == 0\n"
         "print([name for name in {} if name in sys.modules])"
     )
     commands = [["say", "--wait", "length=0"], ["status"], ["cancel"], ["wait"], ["log"], ["voices"], ["set"]]
+    commands += [["pause"], ["resume"]]
     done = run([sys.executable, "-c", code.format([*commands, ["set", "--rate", "150"]], heavy)], scripted.env)
     assert done.out.splitlines()[-1] == "[]", done
 

@@ -209,15 +209,6 @@ def test_a_removed_or_damaged_file_is_replaced_and_reported_once(make_talk: Make
     assert talk.run("doctor", "--silent").out.count("was damaged") == 1
 
 
-def test_two_servers_store_in_the_same_file(make_talk: MakeTalk, tmp_path: Path) -> None:
-    talks = [make_talk("--history", f"{tmp_path}/h.db", scripted=True) for _ in range(2)]
-    ids = {each.run("say", "--wait", "length=0").id for each in talks}
-    for each in talks:
-        await_written(each)
-    for each in talks:
-        assert {goal["id"] for goal in kept_goals(each, history=True)} == ids
-
-
 @pytest.mark.parametrize("times", [1, pytest.param(10, marks=pytest.mark.slow)])
 def test_a_killed_server_loses_at_most_two_seconds_of_its_history(
     make_talk: MakeTalk, tmp_path: Path, times: int

@@ -19,7 +19,7 @@ from talkcli.engine.voices import find_voice
 from talkcli.install import NEURAL_PACKAGES
 from tests.conformance.bareserve import LIMIT, SERVE, TALK, Ended, environment, serving
 from tests.conformance.bareserve import run as run_program
-from tests.engine.test_neural import SLOW_TO_SPEAK, WITHOUT
+from tests.engine.test_neural import WITHOUT
 from tests.support import tiny_voice
 from tests.support.processes import children
 from tests.support.surroundings import needs, needs_packages
@@ -37,7 +37,8 @@ TINY, BROKEN = "piper/tiny", "piper/broken"
 #: The espeak voice that replaces these voices, whose language is en-us.
 INSTEAD = "gmw/en-US"
 LONG = "this goes on and on " * 20
-#: Runs first in each Python process: models load only after the file HOLD is removed, and may take more memory.
+#: Runs first in each Python process: models load only after the file HOLD is removed, and may take more memory. The
+#: server may wait less for its engine.
 SITE = """
 import importlib.abc, importlib.util, os, sys, time
 class Delay(importlib.abc.MetaPathFinder):
@@ -59,6 +60,9 @@ class Delay(importlib.abc.MetaPathFinder):
         spec.loader.exec_module = executed
         return spec
 sys.meta_path.insert(0, Delay())
+if "HANG_LIMIT_S" in os.environ:
+    from talkcli.engine import protocol
+    protocol.HANG_LIMIT_S = float(os.environ["HANG_LIMIT_S"])
 """
 
 
@@ -166,62 +170,6 @@ def test_a_goal_and_those_behind_it_wait_for_its_voice(env: dict[str, str], hold
     assert "voice piper/tiny loaded in " in robot.server.log
 
 
-def test_goals_stop_waiting_if_the_loading_voice_is_changed(env: dict[str, str], hold: Path) -> None:
-    with _robot(env, "--voice", "piper/ti") as robot:
-        assert "loaded" not in robot.server.log
-        robot.until(lambda: robot.neural()["state"] == "loading")
-        goal = robot.say("a", None, voice_only=True)
-        assert robot.state(goal) == "PENDING"
-        assert robot.client.status().server["voice"] == TINY
-        robot.client.set(voice="en-us")
-        assert robot.heard(goal) == ("SUCCEEDED", INSTEAD)
-        robot.client.set(voice="piper/ti")
-        goal = robot.say("a", None)
-        hold.unlink()
-        assert robot.heard(goal) == ("SUCCEEDED", TINY)
-
-
-def test_espeak_speaks_urgent_goals_while_their_voice_is_loading(env: dict[str, str], hold: Path) -> None:
-    with _robot(env) as robot:
-        for urgent in ({"preempt": True}, {"flush": True}, {"priority": 1}, {"ttl": 0.2}):
-            goal = robot.say("a", **urgent)
-            assert robot.heard(goal) == ("SUCCEEDED", INSTEAD)
-            assert f"{goal.id} is spoken with the voice {INSTEAD} instead: piper/tiny is not loaded" in robot.server.log
-        assert f"voice    {INSTEAD}" in run([*TALK, "status", goal.id], env).out
-        late, insists = robot.say(voice_only=True, ttl=0.5), robot.say("x", voice_only=True, priority=1)
-        assert late.wait(LIMIT).reason == "expired"
-        assert robot.state(insists) == "PENDING"
-        hold.unlink()
-        assert robot.heard(insists) == ("SUCCEEDED", TINY)
-
-
-def test_the_first_voice_is_loaded_in_silence_and_others_during_speech(env: dict[str, str], tmp_path: Path) -> None:
-    """Loading the libraries for the first voice stops the process for an audible moment."""
-    tiny_voice.put(tmp_path / "voices", "second")
-    with _robot(env, "--player", "null") as robot:
-        active = robot.say(LONG, None)
-        robot.until(lambda: robot.state(active) == "ACTIVE")
-        goal = robot.say(voice="piper/second")
-        assert robot.neural("piper/second")["state"] == "waiting"
-        robot.client.cancel([active.id])
-        assert robot.heard(goal) == ("SUCCEEDED", "piper/second")
-        log = robot.server.log
-        assert log.index(f"{active.id} PREEMPTED") < log.index("voice piper/second loaded")
-
-        (tmp_path / "hold").touch()
-        active = robot.say(LONG, None, feedback=True)
-        robot.until(lambda: robot.state(active) == "ACTIVE")
-        goal = robot.say()
-        robot.until(lambda: robot.neural()["state"] == "loading")
-        words = active.feedback()
-        assert [next(words).word for _ in range(5)] == ["this", "goes", "on", "and", "on"]
-        (tmp_path / "hold").unlink()
-        robot.until(lambda: robot.neural()["state"] == "loaded")
-        assert robot.state(active) == "ACTIVE"
-        robot.client.cancel([active.id])
-        assert robot.heard(goal) == ("SUCCEEDED", TINY)
-
-
 # -- voices that can't be loaded
 
 
@@ -253,21 +201,6 @@ def test_two_voices_that_exceed_the_memory_limit_speak_in_turn(env: dict[str, st
         assert "unloaded voice piper/tiny to make room" in robot.server.log
 
 
-def test_a_voice_unloaded_while_speaking_is_not_counted_twice(env: dict[str, str], tmp_path: Path) -> None:
-    tiny_voice.put(tmp_path / "voices", "second")
-    env["BALLAST_BYTES"] = "100000000"
-    with _robot(env, "--voice-memory", "180", "--player", "null") as robot:
-        first = robot.say("this goes on and on " * 2)
-        robot.until(lambda: robot.client.goal(first.id).spoken)
-        second = robot.say(voice="piper/second")
-        assert robot.heard(first) == ("SUCCEEDED", TINY)
-        assert robot.heard(second) == ("SUCCEEDED", "piper/second")
-        robot.until(lambda: f"unloaded voice {TINY}, because the voices exceed --voice-memory" in robot.server.log)
-        assert (robot.neural(TINY)["state"], robot.neural("piper/second")["why"]) == (None, None)
-        assert robot.server.log.count("voice piper/second loaded") == 1
-        assert "it uses" not in robot.server.log
-
-
 def test_a_voice_larger_than_the_memory_limit_speaks_and_is_reported(env: dict[str, str]) -> None:
     env["BALLAST_BYTES"] = "100000000"
     with _robot(env, "--voice-memory", "50") as robot:
@@ -286,17 +219,6 @@ def test_a_pitch_is_refused_with_a_voice_of_fixed_pitch(env: dict[str, str]) -> 
 
 
 # -- engines that crash, hang or can't start
-
-
-def test_an_engine_crash_costs_one_goal_and_the_voice_is_loaded_again(env: dict[str, str]) -> None:
-    with _robot(env, "--voice", TINY, "--player", "null") as robot:
-        robot.until_loaded()
-        goal = robot.say(LONG, None)
-        robot.until(lambda: robot.client.goal(goal.id).spoken)
-        robot.kill_engine()
-        assert goal.wait(LIMIT).reason == "engine_crashed"
-        assert robot.heard(robot.say("urgent", None, preempt=True)) == ("SUCCEEDED", INSTEAD)
-        assert robot.heard(robot.say("a", None)) == ("SUCCEEDED", TINY)
 
 
 def test_a_voice_that_crashes_the_engine_twice_is_not_used(env: dict[str, str], hold: Path) -> None:
@@ -331,32 +253,18 @@ def test_espeak_speaks_if_the_files_of_a_voice_are_missing(env: dict[str, str], 
 
 
 def test_an_engine_that_hangs_while_loading_is_replaced(env: dict[str, str], hold: Path) -> None:
+    env["HANG_LIMIT_S"] = "0.5"
     with _robot(env) as robot:
         goal = robot.say(voice_only=True)
         robot.until(lambda: robot.neural()["state"] == "loading")
         for engine in children(robot.server.process.pid):
             os.kill(engine, signal.SIGSTOP)
-        robot.until(lambda: "did not respond for 3 s while loading piper/tiny" in robot.server.log)
+        robot.until(lambda: "did not respond for 0.5 s while loading piper/tiny" in robot.server.log)
         hold.unlink()
         assert robot.heard(goal) == ("SUCCEEDED", TINY)
 
 
 # -- lists, files, refused voices
-
-
-def test_gaps_on_a_slow_machine_are_reported(env: dict[str, str], tmp_path: Path) -> None:
-    (tmp_path / "site" / "sitecustomize.py").write_text(SLOW_TO_SPEAK)
-    with serving({**env, "PYTHONPATH": str(tmp_path / "site")}):
-        done = run([*TALK, "--json", "say", "--wait", "--voice", "piper/tiny", "--voice-only", "a. b"], env)
-        assert run([*TALK, "say", "--wait", "a"], env).code == 0
-        espeak = json.loads(run([*TALK, "--json", "log", "-n", "1"], env).out)
-    assert (espeak["text"], espeak["message"]) == ("a", "Talk completed successfully")
-    goal = json.loads(done.out)
-    assert (goal["state"], goal["voice"]) == ("SUCCEEDED", "piper/tiny")
-    assert re.fullmatch(
-        r"Talk completed successfully, but with \d gaps? \(\d\.\d s in total\): this machine is too slow for the voice",
-        goal["message"],
-    )
 
 
 def test_a_voice_installed_later_can_be_listed_and_used(env: dict[str, str], tmp_path: Path) -> None:
@@ -488,16 +396,6 @@ def test_a_drivers_voice_precedes_a_neural_voice_of_the_same_name(env: dict[str,
         assert run([*TALK, "set", "--voice", "tiny"], env).code == 0
         used = [heard(env, "--voice-only", "--voice", voice) for voice in ("en-us", "EN", "gmw/en-US")]
         assert used == ["piper/tiny", "piper/tiny", "gmw/en-US"], "the language of a neural voice selects that voice"
-
-
-def test_an_unknown_speaker_is_refused(env: dict[str, str], tmp_path: Path) -> None:
-    several = tiny_voice.description(speakers=2)
-    tiny_voice.put(tmp_path / "voices", "two", tiny_voice.model(speakers=2), several)
-    with _robot(env) as robot:
-        assert robot.heard(robot.say(voice="piper/two#p1")) == ("SUCCEEDED", "piper/two#p1")
-        refused = robot.say(voice="piper/two#2").goal
-        assert (refused.state.name, refused.reason) == ("REJECTED", "unknown_voice")
-        assert 'no speaker "2"; the voice has 2 speakers, 0 to 1' in str(refused.message)
 
 
 #: System calls that change a file or use the internet, successful or not.

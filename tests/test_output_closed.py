@@ -197,15 +197,6 @@ def test_a_goal_is_cancelled_if_its_reader_leaves(scripted: Talk, arguments: lis
     assert scripted.goal(goal)["by"]["client"]["pid"] == reader.client.pid
 
 
-def test_a_pending_goal_is_recalled_if_its_reader_goes_away(scripted: Talk) -> None:
-    first = scripted.run("say", ENDLESS).id
-    reader = Reader(scripted, "say", "-w", "second")
-    scripted.watcher.wait_until(lambda event: bool(event.get("goal")) and event["goal"]["text"] == "second")
-    assert reader.leave() == CLOSED
-    assert scripted.watcher.wait_for_terminal(scripted.watcher.goals()[-1]) == "RECALLED"
-    assert scripted.goal(first)["state"] == "ACTIVE"
-
-
 @pytest.mark.parametrize("first", ["reader", "signal"])
 @pytest.mark.parametrize(
     ("arguments", "kind"),

@@ -171,18 +171,6 @@ def test_options_that_cannot_be_combined_are_refused(words: list[str], message: 
     assert message in done.err
 
 
-def test_a_terminal_shows_the_text_as_it_grows(soundless: Talk) -> None:
-    code = "import sys, time\nfor text in sys.argv[1:]: print(end=text, flush=True), time.sleep(0.2)"
-    line = f'{sys.executable} -c "$CODE" "Hello. " "How are " "you?" | {" ".join(TALK)} say --stream -wf'
-    terminal = Terminal(["bash", "-c", line], {**soundless.env, "CODE": code}, 80)
-    try:
-        terminal.wait_until(lambda screen: "WAITING    Hello." in screen.last)
-        assert terminal.finish() == 0
-        assert terminal.screen.lines[-2].endswith("  SUCCEEDED  Hello. How are you?")
-    finally:
-        terminal.close()
-
-
 def test_wait_shows_a_growing_text_as_far_as_it_was_heard(soundless: Talk) -> None:
     typing = Typing(soundless, "say", "--stream", "-w")
     typing.type("One. ")

@@ -236,14 +236,6 @@ def test_a_sentence_is_cut_around_the_current_word() -> None:
         assert MeasuredText("battery low").split(end) == ("battery low"[:end], "battery low"[end:])
 
 
-def test_wide_characters_take_two_columns() -> None:
-    assert [width(character) for character in ("a", "日", "ｱ", "Ａ", "👩", "e\u0301", "…")] == [1, 2, 1, 2, 2, 1, 1]
-    assert width("❤\ufe0f") == width("🇩🇪") / 2 == 2  # some terminals use fewer columns, none uses more
-    heard, lit, ahead = MeasuredText("日本語" * 10).view(12, 15, 11)
-    assert width(heard + lit + ahead) <= 11
-    assert lit == "日本語"
-
-
 def test_escaped_characters_do_not_shift_the_highlight() -> None:
     text = "a\x1b[31m \u202ered\nnext"
     assert MeasuredText(text).view(*position(text, "next"), 80)[:2] == ("a\\x1b[31m \\u202ered\\n", "next")

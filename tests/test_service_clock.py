@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from typing import TYPE_CHECKING
+from typing import Any, cast
 
 import pytest
 
@@ -19,19 +19,7 @@ from talkcli.goals.states import State
 from talkcli.server import speech
 from talkcli.server.speech import Speech
 from tests.support.loop import in_loop
-
-if TYPE_CHECKING:
-    from talkcli.engine import protocol
-
-
-class _BusyEngine:
-    """An engine that accepts every goal and reports nothing."""
-
-    def speak(self, goal: protocol.Speak) -> None:
-        """Do nothing."""
-
-    def announce_next(self, goal_id: str, next_waits: bool, next_is_neural: bool) -> None:
-        """Do nothing."""
+from tests.test_waiting import Engine
 
 
 @pytest.fixture
@@ -44,7 +32,7 @@ def suspends(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 async def _speech_with_pending_goal(ttl: float) -> Speech:
     served = Speech(Scheduler("4k7f", max_queue=1, settings=replace(DEFAULTS, ttl=ttl)))
-    served.engine = _BusyEngine()  # type: ignore[assignment]
+    served.engine = cast("Any", Engine())
     served.scheduler.engine_ready(served.advance_time())
     for text in ("a long sentence", "the door is open"):
         served.apply(served.scheduler.submit(Say(text), Sender(), served.advance_time())[1])

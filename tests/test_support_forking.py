@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.support.forking import Forked, can_fork
+from tests.support.forking import Forked
 from tests.support.surroundings import clean_environment, short_directory
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def test_a_forked_command_ends_like_a_started_one(env: dict[str, str]) -> None:
 
 
 def test_an_early_signal_is_not_lost(env: dict[str, str]) -> None:
-    for _ in range(10):
+    for _ in range(3):
         reading = piped(["say", "-"], env)  # without a signal, this waits forever
         reading.send_signal(signal.SIGINT)
         assert reading.wait(LIMIT_S) in (130, -signal.SIGINT)
@@ -81,12 +81,3 @@ def test_a_forked_server_dies_with_its_parent(env: dict[str, str]) -> None:
             owner.kill()
             while client.recv(65536):
                 pass  # until the server is gone
-
-
-def test_can_fork_rejects_another_interpreter_library_or_locale(env: dict[str, str]) -> None:
-    assert can_fork(env)
-    assert can_fork({**env, "TALK_PLAYER": "null", "HOME": "/elsewhere"})
-    for name, value in (("PYTHONPATH", "/elsewhere"), ("PYTHONUTF8", "0"), ("LD_PRELOAD", "lib.so")):
-        assert not can_fork({**env, name: value}), name
-    for name in ("LC_ALL", "LANG"):
-        assert not can_fork({**env, name: "C"}), name

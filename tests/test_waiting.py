@@ -62,13 +62,16 @@ class Client:
 
 
 class Engine:
-    """An engine that accepts every goal and reports nothing."""
+    """An engine that accepts every goal and reports nothing. It notes its requests in the same list as the test."""
 
-    def speak(self, _: object) -> None:
-        pass
+    def __init__(self) -> None:
+        self.written: list[str] = []
+
+    def speak(self, goal: protocol.Speak) -> None:
+        self.written.append(f"say {goal.text}")
 
     def stop(self, _: str) -> None:
-        pass
+        self.written.append("stop")
 
     def announce_next(self, _: str, next_waits: bool, next_is_neural: bool) -> None:
         """Do nothing."""
@@ -343,22 +346,6 @@ async def test_nested_notifications_are_sent_in_order_despite_a_bug() -> None:
     assert sent == ["first", "of the first", "second"]
 
 
-class _RecordingEngine:
-    """An engine that appends its requests to the same list as the test does with the clients' events."""
-
-    def __init__(self, written: list[str]) -> None:
-        self.written = written
-
-    def speak(self, goal: protocol.Speak) -> None:
-        self.written.append(f"say {goal.text}")
-
-    def stop(self, _: str) -> None:
-        self.written.append("stop")
-
-    def announce_next(self, _: str, next_waits: bool, next_is_neural: bool) -> None:
-        """Do nothing."""
-
-
 @in_loop
 async def test_many_words_at_once_do_not_block_clients() -> None:
     loop, count = asyncio.get_running_loop(), 5 * REPORTS_PER_TURN + 1
@@ -409,9 +396,9 @@ async def test_a_bug_in_a_report_does_not_affect_other_reports(monkeypatch: pyte
 
 @in_loop
 async def test_the_engine_gets_its_next_task_before_clients_get_events() -> None:
-    written: list[str] = []
-    served = Speech(Scheduler("4k7f", max_queue=1))
-    served.engine = _RecordingEngine(written)  # type: ignore[assignment]
+    engine = Engine()
+    written, served = engine.written, Speech(Scheduler("4k7f", max_queue=1))
+    served.engine = cast("Any", engine)
     served.scheduler.engine_ready(served.advance_time())
 
     def changed(record: Record, state: State, _: float) -> None:
