@@ -200,7 +200,7 @@ def test_a_removed_or_damaged_file_is_replaced_and_reported_once(make_talk: Make
         damaged.write(b"garbage " * (os.stat(path).st_size // 8))
     assert talk.request("log", history=True)["error"]["code"] == HISTORY_FAILED
     shown = talk.run("log")  # while the file is damaged, or just after it was replaced
-    assert (shown.code, "only the goals since the start" in shown.err) == (0, "\n" in shown.err)
+    assert (shown.code, "only goals since the server's start" in shown.err) == (0, "\n" in shown.err)
     await_state(talk, lambda found: "was damaged" in str(found["replaced"]))
     assert kept_goals(talk, history=True) == []
     assert os.path.exists(f"{path}.damaged")

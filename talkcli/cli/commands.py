@@ -179,7 +179,7 @@ _SERVE_OPTIONS = (
     option(
         "--lead-in",
         goal_options.MILLISECONDS,
-        "Play silence for TIME, such as 300ms, if the output was idle. "
+        "Play TIME of silence, such as 300ms, if the output was idle. "
         "HDMI, USB and Bluetooth outputs then don't swallow the first word.",
         default=0,
         limits=(0, goal_options.MAX_LEAD_IN_MS),
