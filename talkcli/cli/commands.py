@@ -573,7 +573,7 @@ _ROWS = (
             option("--homeassistant", FLAG, "Show the robot as a device in Home Assistant."),
             _print_unit_option("user", "system"),
             option("--print-acl", FLAG, "Print access rules for mosquitto's acl_file, and exit."),
-            option("--print-addon-acl", FLAG, "Print access rules for Home Assistant's Mosquitto add-on, and exit."),
+            option("--print-addon-acl", FLAG, "Print rules for Home Assistant's Mosquitto add-on, and exit."),
         ),
         rule=_bridge_fault,
     ),
