@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tests.conformance.hearing import QUICK
-from tests.conformance.voices import ESPEAK
+from tests.conformance.hearing import QUICK, render_quick
 from tests.support.compare import assert_heard, assert_only_beginning, assert_silent, extent, matching_length
 from tests.support.espeak import Library
 from tests.support.recording import LOUD
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from tests.conformance.voices import Voice
     from tests.support.compare import Comparison
     from tests.support.recording import Recording
 
@@ -50,7 +48,6 @@ def assert_heard_after_stop(
     following: Sequence[str],
     *,
     first_heard: bool = True,
-    voice: Voice = ESPEAK,
 ) -> list[Comparison]:
     """Assert that the beginning of a new engine's first sentence was heard, and then the following ones whole.
 
@@ -59,8 +56,8 @@ def assert_heard_after_stop(
     """
     samples = heard if isinstance(heard, np.ndarray) else heard.samples
     wrong: AssertionError | None = None
-    turns = [voice.render(following, QUICK)] if voice.repeats else _render_after_stop((stopped, *following), QUICK)
-    beginning = voice.render([stopped], QUICK)[0]
+    turns = _render_after_stop((stopped, *following), QUICK)
+    (beginning,) = render_quick([stopped])
     # The sound server may join the two sentences without any silence between them.
     for start, references in likeliest(samples, turns, [matching_length(samples, beginning)] if first_heard else []):
         try:

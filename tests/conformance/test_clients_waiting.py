@@ -172,25 +172,6 @@ def test_row_33_ctrl_c_cancels_only_the_clients_own_goal(scripted: Talk, command
     assert (done.id, done.err) == (goal_id, message)
 
 
-@limits()
-def test_row_33_a_signal_stops_a_client_that_waits_for_the_greeting() -> None:
-    with short_directory() as home, FakeServer(f"{home}/s", []) as server:
-        for args in (["status"], ["wait"], ["say", "--wait", "hello"]):
-            with subprocess.Popen(
-                [sys.executable, "-m", "talkcli", *args],
-                env=environment(home, TALK_SOCKET=f"{home}/s"),
-                stderr=subprocess.PIPE,
-                text=True,
-            ) as client:
-                server.wait_for_client()
-                client.send_signal(signal.SIGINT)
-                started_at = time.monotonic()
-                _, err = client.communicate(timeout=20)
-            assert client.returncode == 130, (args, err)
-            assert_within(time.monotonic() - started_at, 1 + START, f"the end of {args} after a signal")
-            assert "Traceback" not in err
-
-
 def test_row_34_sigterm_to_a_background_client_cancels_its_goal(scripted: Talk) -> None:
     script = """"$0" -m talkcli say --wait -- "never-ends words=1" & pid=$!
     read line; kill -TERM $pid; wait $pid; echo "code $?" """

@@ -45,14 +45,6 @@ def test_row_22_a_goal_sent_twice_is_spoken_once_for_both_senders(scripted: Talk
     assert len([word for word in scripted.watcher.words("front-door.1") if word["number"] == 1]) == 1
 
 
-def test_row_22_an_attached_sender_that_disconnects_ends_nothing(scripted: Talk) -> None:
-    with scripted.connect() as one:
-        one.request("say", text=TEXT, id="front-door.1", wait=True)
-        with scripted.connect() as two:
-            assert two.request("say", text=TEXT, id="front-door.1", wait=True)["attached"]
-        assert one.receive_event("result")["goal"]["state"] == "SUCCEEDED"
-
-
 def test_row_22_the_commands_accept_ids_of_ros_goals(scripted: Talk) -> None:
     own = "/patrol/goal-1-1712.25"
     assert scripted.run("say", "--id", own, "--", "").code == 5  # the id of a rejected goal can be used again

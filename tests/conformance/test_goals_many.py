@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import random
-import signal
 import threading
 import time
 from typing import TYPE_CHECKING, Any
@@ -15,7 +14,6 @@ import pytest
 
 from tests.conformance.checks import assert_event_order, count_ends
 from tests.conformance.hearing import HELP, PRECISION
-from tests.support import usage
 from tests.support.compare import compare, similarity
 from tests.support.reference import render
 from tests.support.timing import assert_within, limits
@@ -24,7 +22,6 @@ if TYPE_CHECKING:
     from tests.conformance.hearing import Samples
     from tests.conftest import MakeTalk
     from tests.support.connection import Wire
-    from tests.support.processes import Talk
     from tests.support.sink import Sink
 
 CLIENTS = 5
@@ -161,26 +158,3 @@ def _assert_alike(heard: Samples, reference: Samples) -> None:
     assert abs(compared.heard - compared.expected) <= 0.02, compared
     # Another sentence has about 0.1 and 0.2. The first value is also low if the monitor has dropped samples.
     assert max(compared.correlation, similarity(sound, wanted)) > 0.5, compared
-
-
-def test_an_engine_that_reads_nothing_for_a_while_still_speaks(scripted: Talk) -> None:
-    """If its socket is full, the engine may miss updates about waiting goals."""
-    goal = scripted.run("say", "length=0.4").id
-    scripted.watcher.wait_for_word(goal)
-    (engine,) = usage.descendants(scripted.pid)
-    with scripted.connect() as wire:
-        os.kill(engine, signal.SIGSTOP)
-        try:
-            for start in range(0, 800, BATCH):
-                names = [f"behind.{start + number}" for number in range(BATCH)]
-                for name in names:
-                    wire.send({"request": "say", "text": "behind it", "id": name})
-                    wire.send({"request": "cancel", "ids": [name]})
-                replies: list[bool] = []
-                while len(replies) < 2 * BATCH:
-                    message = wire.receive()
-                    replies += [message["ok"]] if "ok" in message else []
-                assert all(replies)
-        finally:
-            os.kill(engine, signal.SIGCONT)
-    assert scripted.watcher.wait_for_terminal(goal) == "SUCCEEDED"

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import time
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
-
-import pytest
+from typing import TYPE_CHECKING
 
 from tests.conformance.checks import assert_event_order, assert_recalled, assert_rejected, states, submit
 from tests.support.timing import assert_within, limits
@@ -182,42 +179,6 @@ def test_a_cancel_reports_more_goals_than_the_output_buffer_holds(make_talk: Mak
     assert_event_order(talk)
 
 
-@pytest.mark.parametrize(
-    ("selection", "chosen"),
-    [
-        ({"ids": ["two", "seven"]}, ["two"]),
-        ({"before": "two"}, ["one", "two"]),
-    ],
-    ids=str,
-)
-def test_a_cancel_ends_the_selected_goals_that_wait_for_room(
-    make_talk: MakeTalk, selection: dict[str, Any], chosen: list[str]
-) -> None:
-    talk = make_talk("--max-queue", "1", scripted=True)
-    active = start_goal(talk, id="early")
-    (queued,) = queue(talk, 0)
-    with talk.connect() as one, talk.connect() as two, talk.connect() as three, talk.connect() as canceling:
-        wires = {"one": one, "two": two, "three": three}
-        for name, wire in wires.items():
-            send_patient(wire, name, **({"id": "two"} if name == "two" else {}))
-        reply = canceling.request("cancel", **selection)
-        assert reply["ok"] == ("ids" not in selection)
-        ended = [item["canceled"]["text"].split()[-1] for item in canceling.items if "canceled" in item]
-        assert [text for text in ended if text in wires] == chosen
-        assert not [item for item in canceling.items if "ended" in item]
-        for name in chosen:
-            goal = wires[name].receive_event("result")["goal"]
-            assert (goal["state"], goal["reason"], goal["started_at"]) == ("RECALLED", "canceled", None)
-            assert goal["by"]["client"]["pid"] == os.getpid()
-            assert states(talk, goal["id"]) == ["PENDING", "RECALLED"]
-        if "two" in chosen:  # sending the goal again returns its end
-            assert submit(talk, "length=0 two", id="two")["state"] == "RECALLED"
-        talk.request("cancel", ids=[active, queued])
-        for name in wires.keys() - chosen:
-            assert wires[name].receive_event("result")["goal"]["reason"] != "canceled"
-    assert_event_order(talk)
-
-
 def test_row_12_feedback_names_its_goal_and_precedes_the_result(scripted: Talk) -> None:
     text = "length=0.2 one two three"
     with scripted.connect() as sender, scripted.connect() as waiter, scripted.connect() as quiet:
@@ -252,7 +213,6 @@ def _shapes(events: list[Message]) -> list[str]:
 
 
 def test_row_50_every_event_is_sent_once_and_in_order(make_talk: MakeTalk) -> None:
-    """Goals with all kinds of ends, as seen by their sender and by a watcher that was connected before."""
     talk = make_talk("--max-queue", "4", scripted=True)
     wanted: dict[str, str] = {}
     with talk.connect() as wire:

@@ -106,18 +106,6 @@ def test_a_pause_before_the_end_of_the_word_is_confirmed_at_its_end(soundless: T
     assert word_places(talk, goal) == list(enumerate(NUMBER.split(), 1))
 
 
-def test_a_cancel_ends_interrupted_goals_too(soundless: Talk) -> None:
-    talk = soundless
-    goal = start_goal(talk, LONG)
-    aside = send(talk, LONG, interject=True)
-    await_word(talk, aside, 1)
-    with talk.connect() as wire:
-        assert wire.request("cancel")["count"] == 2
-        assert {item["canceled"]["id"] for item in wire.items} == {goal, aside}
-    assert talk.watcher.states(goal) == ["PENDING", "ACTIVE", "PREEMPTING", "PREEMPTED"]
-    assert talk.goal(goal)["message"] == "Talk preempted: the goal was cancelled"
-
-
 def test_an_interrupted_goal_continues_after_the_death_of_the_engine(soundless: Talk) -> None:
     talk = soundless
     goal = start_goal(talk, SHORT, number=2)

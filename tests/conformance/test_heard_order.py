@@ -29,7 +29,7 @@ from tests.conformance.hearing import (
     start_goal,
     start_goal_with_client,
 )
-from tests.conformance.voices import with_both
+from tests.conformance.voices import ESPEAK, with_both
 from tests.support.compare import assert_heard, assert_only_beginning, assert_silent, loudness
 from tests.support.reference import Sentence
 from tests.support.timing import assert_within, limits
@@ -63,29 +63,29 @@ def await_spoken(talk: Talk, *goals: str) -> None:
         assert talk.watcher.states(goal_id) == SPOKEN
 
 
-def test_row_28_half_the_volume_sounds_half_as_loud(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
+def test_row_28_half_the_volume_sounds_half_as_loud(make_talk: MakeTalk, sink: Sink) -> None:
     volumes = []
     for volume in (0.5, 1.0):
-        talk = voice.serve(make_talk, sink, "--volume", str(volume))
+        talk = ESPEAK.serve(make_talk, sink, "--volume", str(volume))
         await_spoken(talk, send(talk, HELP))
         samples = heard(talk)
-        assert_same(samples, voice.render([Sentence(HELP, QUICK, volume)])[0])
+        assert_same(samples, ESPEAK.render([Sentence(HELP, QUICK, volume)])[0])
         volumes.append(loudness(samples))
     assert volumes[0] / volumes[1] == pytest.approx(0.5, abs=0.1)
     refused = talk.run("--socket", f"{talk.directory}/other", "serve", "--volume", "1.5")
     assert (refused.code, refused.out, "--volume" in refused.err) == (2, "", True)
 
 
-def test_row_29_half_the_rate_takes_twice_as_long(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
+def test_row_29_half_the_rate_takes_twice_as_long(make_talk: MakeTalk, sink: Sink) -> None:
     durations = []
     for rate in (100, 200):
-        talk = voice.serve(make_talk, sink, rate=rate)
+        talk = ESPEAK.serve(make_talk, sink, rate=rate)
         await_spoken(talk, send(talk, "coming"))
-        durations.append(assert_same(heard(talk), voice.render(["coming"], rate)[0]).heard)
+        durations.append(assert_same(heard(talk), ESPEAK.render(["coming"], rate)[0]).heard)
     assert durations[0] / durations[1] == pytest.approx(2, abs=0.4)
 
 
-def test_row_36_an_expired_goal_is_never_heard(talk: Talk, voice: Voice) -> None:
+def test_row_36_an_expired_goal_is_never_heard(talk: Talk) -> None:
     long = send(talk, LONG)
     goal = send(talk, NEVER, ttl=0.4)
     after = send(talk, LOW)
@@ -95,11 +95,10 @@ def test_row_36_an_expired_goal_is_never_heard(talk: Talk, voice: Voice) -> None
     assert expired["ended_at"] - expired["queued_at"] == pytest.approx(0.4, abs=0.1)
     assert (expired["ttl"], expired["message"].startswith("not spoken: ")) == (0.4, True)
     await_spoken(talk, long, after)
-    assert_heard(heard(talk), voice.render([LONG, LOW]))
+    assert_heard(heard(talk), ESPEAK.render([LONG, LOW]))
 
 
-def test_row_37_a_newer_goal_with_the_same_key_takes_the_old_ones_place(talk: Talk, voice: Voice) -> None:
-    """The active goal is not replaced, although it has the same key."""
+def test_row_37_a_newer_goal_with_the_same_key_takes_the_old_ones_place(talk: Talk) -> None:
     long = start_short_goal(talk, key="battery")
     first = send(talk, "never the first", key="battery")
     other = send(talk, HOME)
@@ -108,12 +107,12 @@ def test_row_37_a_newer_goal_with_the_same_key_takes_the_old_ones_place(talk: Ta
     assert_recalled(talk, first, "replaced", by=second)
     assert_recalled(talk, second, "replaced", by=newest)
     await_spoken(talk, long, newest, other)
-    assert_heard(heard(talk), voice.render([HELP, LOW, HOME]))
+    assert_heard(heard(talk), ESPEAK.render([HELP, LOW, HOME]))
 
 
-def test_row_38_only_a_goal_that_was_heard_throttles_the_next(make_talk: MakeTalk, sink: Sink, voice: Voice) -> None:
+def test_row_38_only_a_goal_that_was_heard_throttles_the_next(make_talk: MakeTalk, sink: Sink) -> None:
     """A throttled goal is silent, and its client exits with 0. An expired or aborted goal throttles nothing."""
-    talk = voice.serve(make_talk, sink, "--player", "aplay")
+    talk = ESPEAK.serve(make_talk, sink, "--player", "aplay")
     aborted = start_goal(talk, LONG, key="battery", throttle=60)
     expired = send(talk, NEVER, key="home", throttle=60, ttl=0.1)
     assert_recalled(talk, expired, "expired")
@@ -130,21 +129,21 @@ def test_row_38_only_a_goal_that_was_heard_throttles_the_next(make_talk: MakeTal
         assert goal["by"] == {"goal": low}
     done = talk.run("say", "--wait", "--key", "home", "--throttle", "60", "--", NEVER)
     assert (done.code, done.out) == (0, "")
-    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW, HOME], voice=voice)
+    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW, HOME])
 
 
-def test_row_39_goals_are_ordered_by_priority_and_then_by_arrival(talk: Talk, voice: Voice) -> None:
+def test_row_39_goals_are_ordered_by_priority_and_then_by_arrival(talk: Talk) -> None:
     long = start_short_goal(talk)
     texts = ["battery", "coming", "please", "coming now"]
     zero, five, one, five_again = [
         send(talk, text, priority=priority) for text, priority in zip(texts, (0, 5, 1, 5), strict=True)
     ]
     await_spoken(talk, long, five, five_again, one, zero)
-    assert_heard(heard(talk), voice.render([HELP, texts[1], texts[3], texts[2], texts[0]]))
+    assert_heard(heard(talk), ESPEAK.render([HELP, texts[1], texts[3], texts[2], texts[0]]))
     assert_event_order(talk)
 
 
-def test_row_40_a_preempting_goal_does_not_interrupt_a_higher_priority(talk: Talk, voice: Voice) -> None:
+def test_row_40_a_preempting_goal_does_not_interrupt_a_higher_priority(talk: Talk) -> None:
     long = start_short_goal(talk, priority=5)
     zero = send(talk, HOME)
     high = send(talk, "coming now", priority=3, preempt=True)
@@ -154,11 +153,10 @@ def test_row_40_a_preempting_goal_does_not_interrupt_a_higher_priority(talk: Tal
     assert_recalled(talk, lower, "preempted", by=same)
     assert_recalled(talk, same, "preempted", by=low)
     await_spoken(talk, long, high, low, zero)
-    assert_heard(heard(talk), voice.render([HELP, "coming now", LOW, HOME]))
+    assert_heard(heard(talk), ESPEAK.render([HELP, "coming now", LOW, HOME]))
 
 
-def test_a_goal_uses_the_settings_at_its_start_except_its_own(talk: Talk, voice: Voice) -> None:
-    """A changed setting applies to all goals that have not started, unless a goal was sent with its own value."""
+def test_a_goal_uses_the_settings_at_its_start_except_its_own(talk: Talk) -> None:
     sentences = [
         Sentence(HELP, rate=QUICK),
         Sentence(LOW, rate=300, volume=0.2),
@@ -170,7 +168,7 @@ def test_a_goal_uses_the_settings_at_its_start_except_its_own(talk: Talk, voice:
     goals = [send(talk, LOW, rate=300, volume=0.2), send(talk, HOME), send(talk, HELP, volume=0), send(talk, LOW)]
     assert talk.request("set", rate=350, volume=0.5)["settings"]["rate"] == 350
     await_spoken(talk, first, *goals)
-    references = voice.render(sentences)
+    references = ESPEAK.render(sentences)
     assert loudness(references[1]) < 0.6 * loudness(references[4])
     del references[3]
     assert_heard(heard(talk), references)
@@ -205,7 +203,7 @@ def test_row_03_a_cancel_is_confirmed_within_150_ms_and_after_the_sound(talk: Ta
             assert_within(replied_at - sent_at, 0.15, f"the cancel after {number} words")
 
 
-def test_row_16_a_terminated_server_answers_every_waiting_client(talk: Talk, voice: Voice) -> None:
+def test_row_16_a_terminated_server_answers_every_waiting_client(talk: Talk) -> None:
     texts = [LONG, LOW, HOME, HELP]
     waiters = []
     for number, text in enumerate(texts, 1):
@@ -224,14 +222,12 @@ def test_row_16_a_terminated_server_answers_every_waiting_client(talk: Talk, voi
     assert {goal["reason"] for goal in results} == {"shutdown"}
     assert talk.watcher.states(goals[0]) == STOPPED
     assert [talk.watcher.states(goal_id) for goal_id in goals[1:]] == [["PENDING", "RECALLED"]] * 3
-    assert_only_beginning(heard(talk), voice.render([LONG])[0])
+    assert_only_beginning(heard(talk), ESPEAK.render([LONG])[0])
     _assert_last_sound_before(talk, ended)
 
 
-def test_row_24_a_preempting_goal_is_heard_after_the_old_one_is_silent(
-    make_talk: MakeTalk, sink: Sink, voice: Voice
-) -> None:
-    talk = voice.serve(make_talk, sink, "--preempt")
+def test_row_24_a_preempting_goal_is_heard_after_the_old_one_is_silent(make_talk: MakeTalk, sink: Sink) -> None:
+    talk = ESPEAK.serve(make_talk, sink, "--preempt")
     goal, first = start_goal_with_client(talk, LONG)
     second = talk.run("say", "--wait", "--", LOW)
     preempted = talk.finish(first)
@@ -244,20 +240,20 @@ def test_row_24_a_preempting_goal_is_heard_after_the_old_one_is_silent(
     assert silent["n"] < talk.watcher.wait_for(second.id, "ACTIVE")["n"]
     ended = talk.goal(goal)
     assert (ended["reason"], ended["by"]) == ("preempted", {"goal": second.id})
-    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW], voice=voice)
+    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW])
 
 
-def test_row_25_a_preempting_goal_goes_before_the_queued_ones(talk: Talk, voice: Voice) -> None:
+def test_row_25_a_preempting_goal_goes_before_the_queued_ones(talk: Talk) -> None:
     first, waiting = [send(talk, text) for text in (LONG, LOW)]
     await_word(talk, first)
     urgent = talk.run("say", "--preempt", "--wait", "--", HOME)
     assert (urgent.code, urgent.err) == (0, "")
     await_spoken(talk, waiting)
     assert talk.watcher.states(first) == STOPPED
-    stopped.assert_heard_after_stop(heard(talk), LONG, [HOME, LOW], voice=voice)
+    stopped.assert_heard_after_stop(heard(talk), LONG, [HOME, LOW])
 
 
-def test_row_27_cancel_current_stops_a_goal_and_the_next_is_spoken(talk: Talk, voice: Voice) -> None:
+def test_row_27_cancel_current_stops_a_goal_and_the_next_is_spoken(talk: Talk) -> None:
     goal, waiter = start_goal_with_client(talk, LONG, "--queue")
     waiting = send(talk, LOW)
     canceled = talk.run("cancel", "--current")
@@ -268,7 +264,7 @@ def test_row_27_cancel_current_stops_a_goal_and_the_next_is_spoken(talk: Talk, v
     assert talk.watcher.states(goal) == STOPPED
     assert talk.watcher.wait_for_terminal(waiting) == "SUCCEEDED"
     assert talk.watcher.states(waiting) == SPOKEN
-    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW], voice=voice)
+    stopped.assert_heard_after_stop(heard(talk), LONG, [LOW])
 
 
 def _assert_last_sound_before(talk: Talk, moment: float) -> None:

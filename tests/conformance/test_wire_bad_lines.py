@@ -158,15 +158,6 @@ def test_an_overlong_line_closes_the_connection(talk: Talk) -> None:
         assert raw.receive_lines(3)[2]["ok"]
 
 
-def test_only_requests_before_an_overlong_line_are_answered(talk: Talk) -> None:
-    requests = [b'{"seq": %d, "request": "resume"}\n' % number for number in range(101)]
-    with Raw(talk.socket) as raw:
-        raw.send(b"".join([*requests[:100], b"a" * MAX_LINE, b"\n", requests[100]]))
-        _, *answers, error = raw.receive_all()
-        assert [reply["seq"] for reply in answers] == list(range(100))
-        assert_error(error, "line_too_long")
-
-
 def test_ten_bad_lines_in_a_row_close_the_connection(talk: Talk) -> None:
     for lines in (b"\n" * 10_000, b"GET / HTTP/1.1\r\nHost: robot\r\n" + b"X: y\r\n" * 20 + b"\r\n"):
         with Raw(talk.socket) as raw:

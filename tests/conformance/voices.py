@@ -43,8 +43,6 @@ _PATIENCE = 30.0
 class Espeak:
     """The voice of libespeak-ng, which renders a repeated sentence differently."""
 
-    repeats = False
-
     def serve(self, make_talk: MakeTalk, sink: Sink, *options: str, rate: int = QUICK, env: Environment = None) -> Talk:
         """Start a server that speaks with this voice to a recorded sink."""
         return make_talk("--rate", str(rate), *options, sink=sink, env=env)
@@ -67,7 +65,6 @@ class Joe:
 
     voices: str
     cache: str
-    repeats = True
 
     def serve(self, make_talk: MakeTalk, sink: Sink, *options: str, rate: int = QUICK, env: Environment = None) -> Talk:
         env = {**self.places, **(env or {})}

@@ -116,13 +116,6 @@ def test_a_driver_finishes_each_sentence_and_reports_its_words(driver: str, befo
             assert [(word.start, word.end) for word in engine.words(goal)] == [(0, 7), (8, 11)]
 
 
-def test_a_driver_gets_a_text_in_markdown_without_its_marks() -> None:
-    with Engine(driver="slow", before=SLOW_DRIVER) as engine:
-        engine.send(protocol.Speak("g1", "**battery** `low`", 200, 1.0, None, 50, format="markdown"))
-        assert engine.until(protocol.Ended).outcome == protocol.OUTCOME_COMPLETED
-        assert [(word.start, word.end) for word in engine.words()] == [(2, 9), (13, 16)]
-
-
 @pytest.mark.parametrize(
     ("more", "reason", "message"),
     [

@@ -161,22 +161,18 @@ def test_a_growing_text_is_interrupted_in_a_part_between_parts_and_while_text_is
         assert [number for *_, number in _words(engine)] == list(range(1, 8))
 
 
-def test_a_text_that_broke_off_continues_with_its_whole_sentences() -> None:
-    text = "One two. Three four. Five"
+@pytest.mark.parametrize(
+    ("text", "fields", "words"),
+    [
+        ("One two. Three four. Five", {"broken": True}, "One two Three four"),
+        ("**One** two [three](http://a.b) four", {"format": "markdown"}, "One two three four"),
+    ],
+)
+def test_a_broken_text_or_markdown_continues_in_its_place(text: str, fields: dict[str, Any], words: str) -> None:
     with Engine() as engine:
-        engine.send(_speak(text, more=True))
-        ended = _interrupt(engine, 1)
-        _continue_to_the_end(engine, ended, text=text, broken=True)
-        assert [text[start:end] for start, end, _ in _words(engine)] == ["One", "two", "Three", "four"]
-
-
-def test_markdown_keeps_its_places() -> None:
-    text = "**One** two [three](http://a.b) four"
-    with Engine() as engine:
-        engine.send(_speak(text, format="markdown"))
-        ended = _interrupt(engine, 2)
-        _continue_to_the_end(engine, ended, text=text, format="markdown")
-        assert [text[start:end] for start, end, _ in _words(engine)] == ["One", "two", "three", "four"]
+        engine.send(_speak(text, **({"more": True} if "broken" in fields else fields)))
+        _continue_to_the_end(engine, _interrupt(engine, 1), text=text, **fields)
+        assert [text[start:end] for start, end, _ in _words(engine)] == words.split()
 
 
 def test_a_third_party_driver_stops_at_once_and_repeats_the_word() -> None:

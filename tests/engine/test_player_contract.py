@@ -358,7 +358,7 @@ def test_a_player_without_samples_ends_without_an_error(case: Case, tmp_path: Pa
 
 
 def test_the_null_player_takes_as_long_as_its_sound() -> None:
-    """Other players take as long as the device. `conformance/test_heard_sound.py` tests this at a sink."""
+    """Other players take as long as the device. `conformance/test_heard_speaking.py` tests this at a sink."""
     player = NullPlayer(RATE)
     started_at = time.monotonic()
     _offer(player, SOUND[: len(SOUND) // 2])

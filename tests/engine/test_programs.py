@@ -175,34 +175,26 @@ def test_a_bare_container_has_no_output(tmp_path: Path, bare: dict[str, str], ha
     assert has_no_output(bare)
     assert has_no_output({})
     assert players.has_no_output({}, f"{tmp_path}/gone", f"{tmp_path}/gone")
+    put(tmp_path / "etc/pulse/client.conf.d/00-host.conf", "autospawn = no\n")
+    assert has_no_output(bare)
+
+
+#: A line that configures a sound server.
+SERVER = "autospawn = no\n  default-server = unix:/run/host/pulse\n"
 
 
 @pytest.mark.parametrize(
-    "path",
+    ("path", "text"),
     [
-        "snd/pcmC1D3p",
-        "run/pulse/native",
-        "run/pipewire-0",
-        "home/.config/pulse/0123-runtime/native",
-        "home/.asoundrc",
-        "home/.config/alsa/asoundrc",
-        "etc/asound.conf",
+        *((path, "") for path in ("snd/pcmC1D3p", "run/pulse/native", "run/pipewire-0", "etc/asound.conf")),
+        *((f"home/{path}", "") for path in (".config/pulse/01-runtime/native", ".asoundrc", ".config/alsa/asoundrc")),
+        *((path, SERVER) for path in ("home/.config/pulse/client.conf", "etc/pulse/client.conf.d/00-host.conf")),
     ],
 )
 def test_a_device_a_socket_or_a_configuration_counts_as_output(
-    tmp_path: Path, bare: dict[str, str], has_no_output: HasNoOutput, path: str
+    tmp_path: Path, bare: dict[str, str], has_no_output: HasNoOutput, path: str, text: str
 ) -> None:
-    put(tmp_path / path)
-    assert not has_no_output(bare)
-
-
-@pytest.mark.parametrize("path", ["home/.config/pulse/client.conf", "etc/pulse/client.conf.d/00-host.conf"])
-def test_a_configured_sound_server_counts_as_output(
-    tmp_path: Path, bare: dict[str, str], has_no_output: HasNoOutput, path: str
-) -> None:
-    put(tmp_path / path, "autospawn = no\n")
-    assert has_no_output(bare)
-    put(tmp_path / path, "autospawn = no\n  default-server = unix:/run/host/pulse\n")
+    put(tmp_path / path, text)
     assert not has_no_output(bare)
 
 

@@ -57,7 +57,7 @@ def _pauses(thread: EngineThread) -> int:
 
 
 def _pause(thread: EngineThread, text: str) -> None:
-    """StartThread a goal, and request a pause during its first word."""
+    """Start a goal, and request a pause during its first word."""
     thread.say(text)
     thread.until(protocol.Word)
     thread.engine.pause("g1", 1)
@@ -73,14 +73,14 @@ def _process(thread: EngineThread) -> EngineProcess:
 
 
 def test_a_pause_may_exceed_all_limits_and_resumes_in_place(start: StartThread) -> None:
-    thread = start(HANG_LIMIT_S=0.5, HOLD_LIMIT_S=0.5)
+    thread = start(HANG_LIMIT_S=0.7, HOLD_LIMIT_S=0.7)
     started_at = time.monotonic()
     _pause(thread, "length=0.4 slow-pause=0.1 two three four")
     assert thread.until(protocol.Held).id == "g1"
-    assert thread.next(0.7) is None
+    assert thread.next(1.0) is None
     thread.engine.resume("g1")
     assert thread.until(protocol.Ended).outcome == OUTCOME_COMPLETED
-    assert time.monotonic() - started_at >= 0.4 + 0.7
+    assert time.monotonic() - started_at >= 0.4 + 1.0
     assert [report.number for report in thread.seen if isinstance(report, protocol.Word)] == [1, 2, 3, 4, 5]
 
 
@@ -206,13 +206,15 @@ def test_the_process_learns_whether_another_goal_waits(start_python: Callable[..
 
 
 def test_a_process_that_reads_late_gets_all_of_a_growing_text(start_python: Callable[..., EngineThread]) -> None:
-    count = 'seen = globals().setdefault("seen", []); seen.append(command.text)'
+    other = 'seen = globals().setdefault("seen", []); seen.append(getattr(command, "text", ""))'
     reply = 'protocol.Ended(command.id, protocol.OUTCOME_COMPLETED, None, str(len("".join(seen))))'
-    thread = start_python("send(protocol.Started(command.id))", f"{count}; command.end and send({reply})")
+    other = f'{other}; getattr(command, "end", False) and send({reply})'
+    thread = start_python("send(protocol.Started(command.id))", other)
     process, sent = _process(thread), threading.Event()
     thread.engine.speak(protocol.Speak("g1", "a", 200, 1.0, None, 50, more=True))
     os.kill(process.pid, signal.SIGSTOP)
     for length in range(2, 5_001):
+        thread.engine.announce_next("g1", length % 2 == 0, next_is_neural=False)
         thread.engine.append("g1", "a" * length, complete=length == 5_000, broke_off=False)
     thread.engine._actions.call(sent.set)
     assert sent.wait(PATIENCE)
@@ -325,8 +327,7 @@ def test_a_goal_submitted_just_before_the_shutdown_ends(start: StartThread, monk
 
 
 def test_after_a_suspend_messages_come_before_time_limits(start: StartThread, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After the machine or the server was suspended, messages are read before time limits are checked."""
-    suspensions = [0.5]
+    suspensions = [0.6]
 
     class Clock:
         def __getattr__(self, name: str) -> Any:
@@ -338,9 +339,9 @@ def test_after_a_suspend_messages_come_before_time_limits(start: StartThread, mo
             return time.monotonic()
 
     words: list[protocol.Word] = []
-    thread = start(HANG_LIMIT_S=0.4)
+    thread = start(HANG_LIMIT_S=0.5)
     monkeypatch.setattr(supervisor, "time", Clock())
-    thread.say("length=0.8 b c d e f g h i j k")
+    thread.say("length=0.9 b c d e f g h i j k")
     words.append(thread.until(protocol.Word))
     assert thread.until(protocol.Ended).outcome == OUTCOME_COMPLETED
     assert not suspensions
@@ -547,9 +548,9 @@ send(protocol.Ended(command.id, protocol.OUTCOME_COMPLETED))
 # -- the queue of actions
 
 
-def test_actions_of_several_threads_are_neither_lost_nor_reordered() -> None:
+def test_any_number_of_actions_of_several_threads_is_neither_lost_nor_reordered() -> None:
     queue, done = ActionQueue(), list[tuple[int, int]]()
-    count = 1000
+    count = 30_000  # more than the pipe that wakes the thread can hold
 
     def submit(sender: int) -> None:
         for number in range(count):
@@ -566,14 +567,5 @@ def test_actions_of_several_threads_are_neither_lost_nor_reordered() -> None:
     for sender in range(3):
         assert [number for source, number in done if source == sender] == [*range(count)]
     queue.close()
-
-
-def test_a_queue_takes_any_number_of_actions_and_ignores_later_ones() -> None:
-    queue, done = ActionQueue(), list[int]()
-    for number in range(100_000):  # more than the pipe that wakes the thread can hold
-        queue.call(lambda number=number: done.append(number))  # type: ignore[misc]
-    queue.run()
-    assert done == list(range(100_000))
-    queue.close()
-    queue.call(lambda: done.append(0))
-    assert len(done) == 100_000
+    queue.call(done.clear)  # a later action is ignored
+    assert done

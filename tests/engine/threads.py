@@ -6,7 +6,8 @@ import contextlib
 import os
 import queue
 import sys
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeVar
 
 import talkcli
 from talkcli.engine import protocol
@@ -14,7 +15,6 @@ from talkcli.engine.parent.supervisor import Supervisor
 
 if TYPE_CHECKING:
     from pathlib import Path
-    from typing import Any
 
     from talkcli.engine.parent.supervisor import Report
 
@@ -84,14 +84,6 @@ class EngineThread:
         self.engine.thread.join(PATIENCE)
 
 
-class StartThread(Protocol):
-    """A function that starts an engine thread. The thread is closed after the test."""
-
-    def __call__(self, script: str = "", **limits: Any) -> EngineThread:
-        """StartThread an engine thread.
-
-        Args:
-            script: what the process does at its start.
-            limits: new values for constants of the supervisor.
-        """
-        ...
+#: Starts an engine thread, which is closed after the test: `start("hang", HANG_LIMIT_S=0.5)`. The first argument is
+#: what the process does at its start, and the others are new values for constants of the supervisor.
+StartThread = Callable[..., EngineThread]

@@ -108,7 +108,7 @@ def test_an_unusable_socket_directory_is_reported_clearly(home: str) -> None:
 @pytest.mark.parametrize("place", [None, "/proc", ""])
 def test_speech_works_with_missing_variables_or_a_missing_home(home: str, sink: Sink, place: str | None) -> None:
     env = environment(home, **{**sink.env, "TALK_SOCKET": f"{home}/s"})
-    assert "XDG_RUNTIME_DIR" not in env  # see `test_servers_places`
+    assert "XDG_RUNTIME_DIR" not in env  # see `test_servers_starting`
     if place is None:
         env = {name: value for name, value in env.items() if name not in ("HOME", "PATH", "LANG", "TMPDIR")}
     else:
