@@ -19,6 +19,7 @@ from tests.conformance.hearing import (
     HOME,
     LONG,
     QUICK,
+    SHORTER,
     await_word,
     engine_process,
     heard,
@@ -37,8 +38,6 @@ if TYPE_CHECKING:
 
 #: A sentence with a long word.
 NUMBER = "one 1234 three"
-#: A sentence that takes 0.6 s.
-SHORT = "two three four five six"
 
 
 def word_places(talk: Talk, goal_id: str) -> list[tuple[int, str]]:
@@ -49,7 +48,7 @@ def test_a_sentence_is_heard_to_the_end_of_a_word_and_continues_after_the_interj
     make_talk: MakeTalk, sink: Sink
 ) -> None:
     talk = make_talk("--player", "pulse", "--rate", str(QUICK), sink=sink)
-    goal = start_goal(talk, SHORT, number=2)
+    goal = start_goal(talk, SHORTER, number=2)
     aside = send(talk, HOME, interject=True)
     await_word(talk, aside, 1)
     with talk.connect() as wire:
@@ -59,29 +58,29 @@ def test_a_sentence_is_heard_to_the_end_of_a_word_and_continues_after_the_interj
     assert (status["active"]["id"], interrupted["id"]) == (aside, goal)
     assert (interrupted["state"], interrupted["paused"], interrupted["interrupted_by"]) == ("ACTIVE", True, aside)
     assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
-    rest = SHORT[len(interrupted["spoken"]) :].lstrip()
+    rest = SHORTER[len(interrupted["spoken"]) :].lstrip()
     samples = heard(talk)
-    fade_begin = matching_length(samples, render_quick([SHORT])[0])
+    fade_begin = matching_length(samples, render_quick([SHORTER])[0])
     assert fade_begin / RATE > interrupted["heard"] / 2, "the beginning differs"
     after = samples[fade_begin + round(FADE_S * RATE) :]
-    stopped.assert_heard_after_stop(after, SHORT, [HOME, rest], first_heard=False)
-    assert word_places(talk, goal) == list(enumerate(SHORT.split(), 1))
-    assert talk.watcher.texts("ACTIVE") == [SHORT, HOME, SHORT]
+    stopped.assert_heard_after_stop(after, SHORTER, [HOME, rest], first_heard=False)
+    assert word_places(talk, goal) == list(enumerate(SHORTER.split(), 1))
+    assert talk.watcher.texts("ACTIVE") == [SHORTER, HOME, SHORTER]
     assert_event_order(talk)
 
 
 def test_the_rest_of_a_goal_keeps_its_rate_and_the_whole_goal_is_reported(soundless: Talk) -> None:
     talk = soundless
-    whole = send(talk, SHORT)
+    whole = send(talk, SHORTER)
     assert talk.watcher.wait_for_terminal(whole) == "SUCCEEDED"
-    goal = start_goal(talk, SHORT, number=2, lead_in=700)
+    goal = start_goal(talk, SHORTER, number=2, lead_in=700)
     aside = send(talk, HOME, interject=True)
     assert talk.request("set", rate=450)["ok"]
     assert talk.watcher.wait_for_terminal(aside) == "SUCCEEDED"
     assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
     expected, found = talk.goal(whole), talk.goal(goal)
     assert word_places(talk, goal) == word_places(talk, whole)
-    assert (found["spoken"], found["spoken_end"]) == (SHORT, len(SHORT))
+    assert (found["spoken"], found["spoken_end"]) == (SHORTER, len(SHORTER))
     assert (found["duration"], found["heard"]) == (pytest.approx(expected["duration"], abs=0.2),) * 2
     assert (found["paused"], found["interrupted_by"], found["voice"]) == (False, None, expected["voice"])
     continued_at = max(event["at"] for event in talk.watcher.events() if event.get("state") == "ACTIVE")
@@ -108,12 +107,12 @@ def test_a_pause_before_the_end_of_the_word_is_confirmed_at_its_end(soundless: T
 
 def test_an_interrupted_goal_continues_after_the_death_of_the_engine(soundless: Talk) -> None:
     talk = soundless
-    goal = start_goal(talk, SHORT, number=2)
-    aside = start_goal(talk, SHORT, number=1, interject=True)
+    goal = start_goal(talk, SHORTER, number=2)
+    aside = start_goal(talk, SHORTER, number=1, interject=True)
     os.kill(engine_process(talk), signal.SIGKILL)
     assert talk.watcher.wait_for_terminal(goal) == "SUCCEEDED"
     assert talk.goal(aside)["reason"] == "engine_crashed"
-    assert word_places(talk, goal) == list(enumerate(SHORT.split(), 1))
+    assert word_places(talk, goal) == list(enumerate(SHORTER.split(), 1))
 
 
 def test_a_growing_text_that_waits_for_text_is_interrupted_at_once_and_continues(soundless: Talk) -> None:

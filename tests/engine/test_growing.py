@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from tests.support.sink import Sink
 
-TEXT = "I found the charger. Shall I go there now?"
+TEXT = "I found it. Shall I go there?"
 RATE = 450
 
 

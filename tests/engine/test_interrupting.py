@@ -66,7 +66,7 @@ def _tiny_voice(folder: Path) -> dict[str, str]:
 @pytest.mark.parametrize("voice", [None, "piper/tiny"])
 def test_the_parts_of_an_interrupted_sentence_have_its_words_and_its_length(tmp_path: Path, voice: str | None) -> None:
     environment = _tiny_voice(tmp_path) if voice else {}
-    given: dict[str, Any] = {"text": "one two three, four", "voice": voice, "voice_only": voice is not None}
+    given: dict[str, Any] = {"text": "one two, three", "voice": voice, "voice_only": voice is not None}
     with Engine(environment=environment) as engine:
         engine.send(_speak(**given))
         whole, words = engine.until(protocol.Ended), _words(engine)
@@ -74,7 +74,7 @@ def test_the_parts_of_an_interrupted_sentence_have_its_words_and_its_length(tmp_
         engine.send(_speak(**given))
         ended = _interrupt(engine, 1)
         engine.send(_speak(**given, **_rest(engine, ended)))
-        ended = _continue_to_the_end(engine, _interrupt(engine, 3), **given)
+        ended = _continue_to_the_end(engine, _interrupt(engine, 2), **given)
         assert _words(engine) == words
         assert ended.heard == pytest.approx(whole.heard, abs=0.2)
         assert ended.duration == pytest.approx(ended.heard, abs=0.001)
@@ -122,13 +122,14 @@ def test_a_sentence_ends_as_usual_if_no_word_follows() -> None:
 
 
 def test_a_long_word_is_cut_off_and_repeated_but_reported_once() -> None:
-    text = "go 12345678 now"
-    with limits(), Engine() as engine:
+    soon = "from talkcli.engine.child import runner; runner.WORD_END_LIMIT_S = 0.2"
+    text = "go 1234 now"
+    with limits(), Engine(before=soon) as engine:
         engine.send(_speak(text))
         engine.until_word(2)
         interrupted_at = time.monotonic()
         ended = _interrupt(engine, 0)
-        assert_within(time.monotonic() - interrupted_at, 1.2, "the end of a long word")
+        assert_within(time.monotonic() - interrupted_at, 0.5, "the end of a long word")
         assert ended.rest == 3
         _continue_to_the_end(engine, ended, text=text)
         assert [text[start:end] for start, end, _ in _words(engine)] == text.split()

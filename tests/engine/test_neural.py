@@ -41,7 +41,7 @@ VOICE = "piper/tiny"
 #: Code for the start of the process that makes loading slow, as on a slow machine.
 SLOW_TO_LOAD = before_call("synthesizers.inference:Model._set_halves", "time.sleep(0.3)")
 #: Code that makes all samples of a sentence late, except the first piece.
-SLOW_TO_SPEAK = before_call("synthesizers.inference:Model.decode", "time.sleep(1.4 if arguments[2] else 0)")
+SLOW_TO_SPEAK = before_call("synthesizers.inference:Model.decode", "time.sleep(0.8 if arguments[2] else 0)")
 #: Code that hides packages.
 WITHOUT = """
 import sys, importlib.abc
@@ -396,7 +396,7 @@ def test_gaps_are_counted_and_words_are_reported_when_heard(
             assert event.gap_seconds == pytest.approx(sum(silent), abs=0.1 * len(silent))
         else:  # on a busy machine, aplay may begin so late that it has nothing to wait for
             assert_within(abs(event.gap_seconds - sum(silent)), 0, "the difference between counted and heard gaps")
-    assert event.gap_seconds > 0.5
+    assert event.gap_seconds > 0.3
     assert event.duration is not None
     assert event.duration - 0.26 == pytest.approx(len(loud) / RATE, abs=0.05), "without the silence at the end"
     for reported_at, position in reported:
