@@ -423,8 +423,8 @@ _ROWS = (
         summary="Show what was said, by whom, and how it ended.",
         function="log:log",
         description="""
-        Show the goals that have ended. The newest goal is last. A sender is shown by its own name (in quotes), or else
-        by the program that called talk.
+        Show the goals that have ended, with the newest at the end. A sender is shown by its name (in quotes), or
+        otherwise by the program that called talk.
 
         With 'talk serve --history', goals from before the server's start are included. By default, 20 goals are shown,
         or 2,200 with a filter. TIME is 14:00, yesterday, '2026-11-24 14:00', or 2h (ago).
@@ -449,9 +449,9 @@ _ROWS = (
 
         The command returns when the robot is silent. If silence is not confirmed within 2 seconds, the exit code is 1.
 
-        With --while, the command runs COMMAND when the robot is silent, and returns its exit code (126 or 127: it can't
-        be run). The pause ends with COMMAND, or after 10 minutes or the TIME of --for. Speech continues when all pauses
-        have ended. 'talk resume' ends them all.
+        With --while, the command runs COMMAND when the robot is silent, and returns its exit code (126 or 127 if it
+        can't be run). The pause ends with COMMAND, or after 10 minutes or the TIME of --for. Speech continues when all
+        pauses have ended. 'talk resume' ends them all.
         """,
         fleet_function="several:pause",
         examples="""
@@ -521,7 +521,7 @@ _ROWS = (
         With --silent, the command starts its own engine, which plays silence through the server's player. No
         goal is delayed, and nothing is logged.
 
-        With --robot, the command checks the connection to a robot of a fleet: broker, certificate, login, permissions,
+        With --robot, the command checks the connection to a robot in a fleet: broker, certificate, login, permissions,
         and the robot's answer.
         """,
         connects=False,
