@@ -140,14 +140,6 @@ def local(scripted: Talk, tmp_path: Path) -> dict[str, str]:
     return {**scripted.env, "TALK_SOCKET": "", "XDG_RUNTIME_DIR": str(tmp_path)}
 
 
-def test_an_empty_socket_option_is_refused(scripted: Talk, local: dict[str, str]) -> None:
-    for arguments in (["--socket", "", "say", "hello"], ["--socket=", "cancel"], ["serve", "--socket", ""]):
-        done = run([*TALK, *arguments], local)
-        assert (done.code, done.out) == (2, "")
-        assert "--socket: must not be empty; check the variable that should contain the value" in done.err
-    assert scripted.watcher.goals() == []
-
-
 def test_empty_variables_count_as_unset(scripted: Talk, local: dict[str, str]) -> None:
     for arguments in (["say", "length=0"], ["say", "--lines"], ["wait"], ["status"], ["voices"]):
         done = run([*TALK, *arguments], {**local, "TALK_NAME": ""})

@@ -85,13 +85,12 @@ def answer(connected: socket.socket, requests: list[dict[str, Any]]) -> None:
 @pytest.mark.parametrize(
     "greeting",
     [
-        [GREETING],
         [GREETING[:10], GREETING[10:]],
         [b"", GREETING],
         [GREETING.replace(b'{"talk": 1,', b'{ "talk":1,')],
         [GREETING[:-1] + b"\n" + b'{"event": "alive"}\n'],
     ],
-    ids=["at once", "in parts", "late", "other spacing", "with an event"],
+    ids=["in parts", "late", "other spacing", "with an event"],
 )
 def test_a_request_is_sent_once_however_the_server_greets(greeting: list[bytes]) -> None:
     requests: list[dict[str, Any]] = []

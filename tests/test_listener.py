@@ -9,16 +9,12 @@ import stat
 import subprocess
 import threading
 
-import click
 import pytest
 
-import talkcli
 from talkcli.server import listener
 from tests.conformance.bareserve import SERVE, environment, run, serving
+from tests.faults.test_users import NOBODY, as_user, copy_package
 from tests.support.connection import Wire
-from tests.support.surroundings import needs
-
-NOBODY = 65534
 
 
 def refused(home: str, *arguments: str, code: int = 11, **extra: str) -> str:
@@ -135,14 +131,8 @@ def test_an_unsafe_directory_is_refused(home: str) -> None:
 @pytest.mark.skipif(os.getuid() != 0 or not shutil.which("setpriv"), reason="only root can act as another user")
 def test_a_refused_client_of_another_user_exits_with_10(home: str) -> None:
     path = f"{home}/s"
-    # The other user may be unable to read this checkout and its interpreter, so use a copy and the system's Python.
-    needs("/usr/bin/python3")
-    for package in (talkcli, click):
-        folder = os.path.dirname(str(package.__file__))
-        shutil.copytree(folder, f"{home}/lib/{package.__name__}", ignore=shutil.ignore_patterns("__pycache__"))
-    subprocess.run(["chmod", "-R", "a+rX", f"{home}/lib"], check=True)
-    client = ["setpriv", f"--reuid={NOBODY}", "--clear-groups", "/usr/bin/python3", "-m", "talkcli"]
-    other_user = environment(home, PYTHONPATH=f"{home}/lib", PYTHONDONTWRITEBYTECODE="1")
+    other_user = copy_package(home)
+    client = [*as_user(NOBODY), "/usr/bin/python3", "-m", "talkcli"]
     with serving(environment(home), "--socket", path):
         for mode, arguments in ((0o600, ["status"]), (0o666, ["say", "hello"])):
             os.chmod(path, mode)

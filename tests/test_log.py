@@ -12,9 +12,6 @@ import pytest
 
 from talkcli import peers
 from talkcli.goals.options import MAX_LOG_GOALS
-from talkcli.terminal.text import width
-from tests.conformance.bareserve import TALK
-from tests.support.terminal import Terminal
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -79,21 +76,6 @@ def test_log_shows_the_latest_goals_oldest_first(scripted: Talk) -> None:
     assert [line.split()[2] for line in scripted.run("log", "--count", str(MAX_LOG_GOALS)).out.splitlines()] == numbers(
         history
     )
-
-
-def test_lines_are_aligned_and_fit_the_terminal(scripted: Talk, history: list[str]) -> None:
-    """`tests/unit/test_transcript.py` tests other widths."""
-    columns = 80
-    with Terminal([*TALK, "log"], {"TERM": "xterm", **scripted.env}, columns) as shown:
-        assert shown.finish() == 0
-        lines, coloured = shown.lines, shown.raw
-    assert [line.split()[2] for line in lines] == numbers(history)
-    assert max(map(width, lines)) <= columns
-    assert '…"' in lines[-1]
-    assert len({line.index('"') for line in lines}) == 1
-    assert "audio_lost"[:8] in lines[1]
-    assert b"\x1b[32mSUCCEEDED\x1b[0m" in coloured
-    assert b"\x1b[31mREJECTED \x1b[0m" in coloured
 
 
 def test_a_script_that_starts_talk_through_another_program_is_shown(tmp_path: Path) -> None:

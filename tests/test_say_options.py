@@ -61,15 +61,11 @@ def test_markdown_is_spoken_without_its_marks(make_talk: MakeTalk, tmp_path: Pat
         (["--ahead", "3", "hello"], ["--ahead", "--lines"]),
         (["-o", "x.wav"], ["TEXT"]),
         (["-o", "x.wav", "-w", "--key", "k", "hello"], ["--output", "--wait, --key"]),
-        (["-o", "x.wav", "--queue", "hello"], ["--output", "--queue"]),
         (["-o", "x.wav", "--lines"], ["--output", "--lines"]),
-        (["-o", "x.wav", "-f", "--lead-in", "3", "hello"], ["--output", "--feedback", "--lead-in"]),
-        (["-o", "x.wav", "--ttl", "0", "--throttle", "0", "hello"], ["--ttl, --throttle"]),
         (["-o", "x.wav", "--id", "mine", "--as", "me", "hello"], ["--id, --as"]),
         (["--key", "k\udcff\udcfe", "hello"], ["--key", "0xff"]),
         (["--as", "日\udcff", "hello"], ["--as", "0xff"]),
         (["--as=", "-o", "x.wav", "hello"], ["--as", "variable"]),
-        (["--lead-in", "5001", "hello"], ["--lead-in", "5000"]),
     ],
 )
 def test_contradictions_and_values_out_of_range_are_usage_errors(arguments: list[str], hints: list[str]) -> None:

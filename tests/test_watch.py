@@ -86,16 +86,6 @@ def test_watch_starts_with_the_current_goals(scripted: Talk) -> None:
     assert watch.end() == 130
 
 
-def test_words_are_shown_with_feedback(scripted: Talk) -> None:
-    watch = Lines(scripted, "-f")
-    goal_id = scripted.run("say", "battery low\x1b[m").id
-    watch.next("SUCCEEDED")
-    words = [line for line in watch.lines if "  word  " in line]
-    heads = rf"\S+  word        {number(goal_id)} +"
-    assert [re.sub(heads, "", line) for line in words] == ["battery  0.00 s", r"low\x1b[m  0.05 s"]
-    assert watch.end() == 130
-
-
 def test_json_prints_the_protocols_events(scripted: Talk) -> None:
     watch = Lines(scripted, "--json")
     snapshot = json.loads(watch.lines[0])

@@ -20,6 +20,7 @@ import pytest
 from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
 from tests.conformance.rawsocket import Raw
 from tests.faults.broken import assert_answers
+from tests.faults.test_service_units import SCRIPTED
 from tests.support import processes, usage
 from tests.support.connection import Wire
 from tests.support.processes import children
@@ -199,7 +200,6 @@ def test_a_server_with_a_full_backlog_does_not_block_clients(scripted: Talk) -> 
     assert scripted.run("say", "--wait", "length=0").code == 0
 
 
-SCRIPTED = [SERVE[0], processes.SCRIPTED]
 CLIENTS = 60
 #: Limit in seconds for the recovery of a full server.
 RECOVERY_S = 5.0

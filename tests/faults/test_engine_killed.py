@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tests.conftest import MakeTalk
-    from tests.support.connection import Message
     from tests.support.processes import Talk
     from tests.support.recording import Recording
     from tests.support.sink import Sink
@@ -80,7 +79,10 @@ def test_a_killed_or_frozen_engine_loses_at_most_one_goal(
                 usage.wait_until(talk.pid, lambda now: now.processes == 2 and engine_process(talk) != engine)
             following = following or send(talk, LOW, rate=RATE)
             if goal:
-                spoken = _assert_lost(talk, goal, number)["spoken"]
+                reason, error, _ = SIGNALS[number]
+                assert await_end(talk, goal, HANG) == "ABORTED"
+                assert_aborted(talk.goal(goal), reason, error)
+                spoken = talk.goal(goal)["spoken"]
                 assert activity in {"idle", "in playback"} or "two three" in spoken != LONG
             if activity == "paused":
                 assert talk.request("status")["server"]["paused"]
@@ -90,7 +92,8 @@ def test_a_killed_or_frozen_engine_loses_at_most_one_goal(
                 talk.request("resume")
             assert talk.watcher.wait_for_terminal(following) == "SUCCEEDED"
         talk.stop()
-        heard_at = _assert_next(recording, since, SIGNALS[number][2], f"{number.name}, {activity}")
+        heard_at = assert_heard_last(recording, render([LOW], rate=RATE)[0])
+        assert_within(heard_at - since, SIGNALS[number][2], f"the next goal after {number.name}, {activity}")
         if activity == "in synthesis":
             assert_only_beginning(recording.between(0, heard_at - PRECISION), render([LONG])[0])
 
@@ -123,7 +126,7 @@ OTHER_SESSION = "setsid -w aplay -q -t raw -f S16_LE -c 1 -r {rate} --buffer-tim
 def test_processes_that_a_player_started_in_another_session_are_killed(make_talk: MakeTalk, sink: Sink) -> None:
     needs("setsid")
     talk = make_talk("--player", OTHER_SESSION, sink=sink)
-    with no_leaks(talk):
+    with limits(), no_leaks(talk):
         goal = start_goal(talk, LONG, number=1)
         playing = [pid for pid in usage.descendants(talk.pid) if command_line(pid).startswith("aplay")]
         assert playing
@@ -138,22 +141,6 @@ def _feeding(talk: Talk, player: int) -> bool:
     """Return whether the engine still has the other end of the player's standard input open."""
     pipe = os.readlink(f"/proc/{player}/fd/0")
     return pipe in usage.descriptors(engine_process(talk)).values()
-
-
-def _assert_lost(talk: Talk, goal_id: str, number: signal.Signals) -> Message:
-    """Assert that a goal was ABORTED because its engine got this signal, and return the goal."""
-    reason, error, _ = SIGNALS[number]
-    assert await_end(talk, goal_id, HANG) == "ABORTED"
-    goal = talk.goal(goal_id)
-    assert_aborted(goal, reason, error)
-    return goal
-
-
-def _assert_next(recording: Recording, signalled_at: float, limit: float, case: str) -> float:
-    """Assert that LOW was heard in time after the signal, and return the time."""
-    heard_at = assert_heard_last(recording, render([LOW], rate=RATE)[0])
-    assert_within(heard_at - signalled_at, limit, f"the next goal after {case}")
-    return heard_at
 
 
 #: Seconds for the watchdog thread to act and for the event to reach the watcher.

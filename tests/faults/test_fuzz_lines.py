@@ -12,9 +12,8 @@ from tests.tools.fuzz_texts import daily_seed
 SECONDS = float(os.environ.get("TALK_TEST_FUZZ") or (30 if os.environ.get("CI") else 8))
 
 
-@pytest.mark.parametrize("count", [2_000, pytest.param(20_000, marks=pytest.mark.slow)])
-def test_every_mutated_line_gets_one_reply(count: int) -> None:
-    replies = fuzz(20, count=count)
+def test_every_mutated_line_gets_one_reply() -> None:
+    replies = fuzz(20, count=2_000)
     assert len(replies) > 8, f"hardly any errors: {replies}"
 
 

@@ -19,7 +19,7 @@ from talkcli.daemon import log
 from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
 from tests.conformance.hearing import engine_process, send, start_goal
 from tests.faults.broken import write
-from tests.support import processes
+from tests.faults.test_service_units import SCRIPTED
 from tests.support.connection import Wire
 from tests.support.surroundings import MARK, assert_none_left, dying_with_parent
 from tests.support.timing import assert_within, limits
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
     from tests.conftest import MakeTalk
 
-SCRIPTED = [SERVE[0], processes.SCRIPTED]
 #: A server that speaks at the maximum rate.
 FAST = [*SERVE, "--rate", "450"]
 #: A long text, and a number of requests whose replies with such texts exceed a connection's buffers.

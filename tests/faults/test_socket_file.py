@@ -17,7 +17,9 @@ import pytest
 
 from talkcli.server.run import SOCKET_CHECK_S
 from tests.conformance.bareserve import SERVE, TALK, BareServe, environment, run, serving
-from tests.support import processes, usage
+from tests.faults.test_service_units import SCRIPTED, listening_at, passing_command
+from tests.faults.test_users import NOBODY
+from tests.support import usage
 from tests.support.connection import Wire
 
 if TYPE_CHECKING:
@@ -25,7 +27,6 @@ if TYPE_CHECKING:
 
 
 HASTY = [sys.executable, os.path.join(os.path.dirname(os.path.abspath(__file__)), "hasty_serve.py")]
-SCRIPTED = [SERVE[0], processes.SCRIPTED]
 #: Limit in seconds until a server that checks every 0.05 s can be reached again.
 LIMIT_S = 5.0
 
@@ -223,24 +224,18 @@ def test_a_server_exits_if_its_socket_path_can_no_longer_be_used(
 
 
 def test_a_removed_file_of_a_passed_socket_is_only_reported(home: str) -> None:
-    path = f"{home}/passed"
-    with socket.socket(socket.AF_UNIX) as listening:
-        listening.bind(path)
-        listening.listen()
-        passing = f"import os; os.dup2({listening.fileno()}, 3); os.environ['LISTEN_PID'] = str(os.getpid()); "
-        passing += "import sys; os.execv(sys.argv[1], sys.argv[1:])"
-        command = [sys.executable, "-S", "-c", passing, *HASTY]
-        with serving(environment(home, LISTEN_FDS="1"), command=command, pass_fds=[listening.fileno()]) as server:
-            with Wire(path) as wire:
-                os.unlink(path)
-                await_true(lambda: "systemctl restart talk.socket" in server.log)
-                time.sleep(0.2)
-                assert wire.request("status")["ok"]
-            assert not os.path.exists(path)
-            assert server.log.count("systemctl restart") == 1  # reported once, not at every check
-
-
-NOBODY = 65534
+    path, env = f"{home}/passed", environment(home, LISTEN_FDS="1")
+    with (
+        listening_at(path) as passed,
+        serving(env, command=passing_command(passed, HASTY), pass_fds=[passed.fileno()]) as server,
+        Wire(path) as wire,
+    ):
+        os.unlink(path)
+        await_true(lambda: "systemctl restart talk.socket" in server.log)
+        time.sleep(0.2)
+        assert wire.request("status")["ok"]
+        assert not os.path.exists(path)
+        assert server.log.count("systemctl restart") == 1  # reported once, not at every check
 
 
 @pytest.fixture

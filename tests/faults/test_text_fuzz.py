@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import itertools
 import os
-import random
 
 import pytest
 
-from tests.tools.fuzz_texts import Case, cases, crashers, daily_seed, list_voices, speak_all
+from tests.tools.fuzz_texts import cases, list_voices, speak_all
 
 SECONDS = float(os.environ.get("TALK_TEST_FUZZ") or (30 if os.environ.get("CI") else 5))
-#: Number of texts of each kind that crashes libespeak-ng.
-TEXTS_PER_KIND = 6
 
 
 @pytest.mark.parametrize("growing", [False, True], ids=["whole", "growing"])
@@ -27,20 +24,3 @@ def test_mutated_texts_end_once_and_never_overflow_a_buffer(count: int | None, g
     assert not tally.overflows, tally.overflows
     assert tally.texts > (20 if count else SECONDS)
     assert len(os.listdir("/proc/self/fd")) == before
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(300)
-def test_crashing_texts_with_todays_seed_are_spoken_with_the_guard() -> None:
-    voices = list_voices()
-    source = random.Random(daily_seed())
-    texts = [
-        Case(source.choice(voices) if voice is None else voice, text)
-        for voice, text in itertools.islice(crashers(source), 5 * TEXTS_PER_KIND)
-    ]
-    unguarded = speak_all(texts, guarded=False)
-    assert not unguarded.faults, unguarded.faults
-    assert len(unguarded.deaths) > len(texts) // 2, f"these texts need no guard: {unguarded}"
-    tally = speak_all(texts, guarded=True)
-    assert not tally.faults, tally.faults
-    assert not tally.deaths, tally.deaths

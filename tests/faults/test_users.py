@@ -16,15 +16,14 @@ import click
 import pytest
 
 import talkcli
-from tests.conformance.bareserve import SERVE, TALK, environment, run, serving
-from tests.support import processes
+from tests.conformance.bareserve import TALK, environment, run, serving
+from tests.faults.test_service_units import SCRIPTED
 from tests.support.connection import Wire
 from tests.support.surroundings import needs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-SCRIPTED = [SERVE[0], processes.SCRIPTED]
 NOBODY = 65534
 #: The group of the server and of some strangers.
 GROUP = 4242
@@ -97,6 +96,16 @@ def impostor(path: str) -> Iterator[Callable[[], bytes]]:
             yield process.stdout.readline
         finally:
             process.kill()
+
+
+def copy_package(home: str) -> dict[str, str]:
+    """Copy talk for users who may not be able to read this checkout, and return the environment for the copy."""
+    needs("/usr/bin/python3")
+    for package in (talkcli, click):
+        folder = os.path.dirname(str(package.__file__))
+        shutil.copytree(folder, f"{home}/lib/{package.__name__}", ignore=shutil.ignore_patterns("__pycache__"))
+    subprocess.run(["chmod", "-R", "a+rX", f"{home}/lib"], check=True)
+    return environment(home, PYTHONPATH=f"{home}/lib", PYTHONDONTWRITEBYTECODE="1")
 
 
 def replies(done: subprocess.CompletedProcess[str]) -> list[dict[str, Any]]:
@@ -188,17 +197,12 @@ def test_a_server_at_run_talk_is_trusted_whoever_runs_it(home: str) -> None:
 
 
 def test_a_users_server_admits_root_and_refuses_other_users(home: str) -> None:
-    needs("/usr/bin/python3")  # other users may not be able to read this checkout or its interpreter
-    for package in (talkcli, click):
-        folder = os.path.dirname(str(package.__file__))
-        shutil.copytree(folder, f"{home}/lib/{package.__name__}", ignore=shutil.ignore_patterns("__pycache__"))
-    subprocess.run(["chmod", "-R", "a+rX", f"{home}/lib"], check=True)
+    env = copy_package(home)
     os.mkdir(f"{home}/other")
     os.chown(f"{home}/other", 4141, 4141)
     path = f"{home}/other/s"
-    env = environment(home, TALK_SOCKET=path, PYTHONPATH=f"{home}/lib", PYTHONDONTWRITEBYTECODE="1")
     command = [*as_user(4141), "/usr/bin/python3", "-m", "talkcli", "serve", "--player", "null"]
-    with serving(env, command=command):
+    with serving({**env, "TALK_SOCKET": path}, command=command):
         assert run([*TALK, "--socket", path, "status"], environment(home)).code == 0
         os.chmod(path, 0o666)
         (reply,) = replies(stranger(path, {"request": "status"}))

@@ -133,20 +133,6 @@ def random_text(source: random.Random) -> str:
     return text
 
 
-def crashers(source: random.Random) -> Iterator[tuple[str | None, str]]:
-    """Yield texts that crash the library without the guard, each with its voice (None if any voice crashes)."""
-    while True:
-        between = source.choice((".", ". ", ".,", " . ", "..", ".՞", ".;"))
-        before = source.choice(("", "Hello, ", "http://", "5 ", "« "))
-        yield None, before + "".join(_letter(source) + between for _ in range(source.randrange(95, 180)))
-        yield None, before + f"{_letter(source)}.{_letter(source) * source.randrange(165, 300)}"
-        ending = source.choice(("ing", "s", "er", "en", "erne"))
-        yield "gmq/da", before + source.choice("abdeoåø") * source.randrange(165, 400) + ending
-        sign = source.choice(("'", "…", "°", "_", "₤", "–"))
-        yield source.choice(("aav/vi", "gmq/da")), source.choice(("", "xin! ", " ")) + f"{sign}-{source.choice('oaie')}"
-        yield "gmw/en", before + _letter(source) + "'s" * source.randrange(80, 200)
-
-
 def _letter(source: random.Random) -> str:
     return source.choice("abcdefghijklmnopqrstuvwxyzéßжшλ")
 
