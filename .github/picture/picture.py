@@ -101,6 +101,7 @@ class Screen:
         return Frame(at, tuple(map(tuple, self.rows)))
 
     def _control(self, numbers: str, letter: str) -> None:
+        """Carry out a control sequence. Exit with an error if it isn't supported."""
         if letter == "m":
             self._attributes = "" if numbers in {"", "0"} else numbers
         elif letter == "K":
@@ -110,7 +111,7 @@ class Screen:
 
 
 def record(speed: float) -> list[Frame]:
-    """Run commands in a terminal, and record the screen.
+    """Run the commands in a terminal. Return the recorded screens.
 
     At speed 0, there are no pauses.
     """
@@ -143,7 +144,7 @@ def _environment(place: str) -> dict[str, str]:
 
 
 def _serve(stack: contextlib.ExitStack, env: dict[str, str]) -> None:
-    """Start a server, and wait until its engine is ready."""
+    """Start a server that ends with `stack`, and wait until its engine is ready."""
     server = subprocess.Popen(
         [sys.executable, "-m", "talkcli", "serve", "--player", "null", "--rate", "120"],
         env=env,
@@ -187,23 +188,23 @@ class _Typist:
         while (left := end - time.monotonic()) > 0:
             self._draw(left)
 
-    def watch_until(self, seen: Callable[[str], bool]) -> None:
-        """Record the screen until its last row meets a condition."""
+    def watch_until(self, condition: Callable[[str], bool]) -> None:
+        """Record the screen until `condition` is true for the last row."""
         end = time.monotonic() + COMMAND_LIMIT_S
-        while not seen(self._screen.last()):
+        while not condition(self._screen.last()):
             self._draw(end - time.monotonic())
             if time.monotonic() > end:
                 raise SystemExit(f"the terminal still shows {self._screen.last()!r}")
 
     def _draw(self, seconds: float) -> None:
-        """Wait for output, and record the new screen."""
+        """Wait up to `seconds` for output. If there is any, record the new screen."""
         if select.select([self._terminal], [], [], max(seconds, 0))[0]:
             self._screen.draw(os.read(self._terminal, 65536).decode())
             self.frames.append(self._screen.frame(time.monotonic() - self._began))
 
 
 def _type(terminal: int, speed: float) -> list[Frame]:
-    """Type all commands one after another, and record the screen."""
+    """Type all commands one after another. Return the recorded screens."""
     typist = _Typist(terminal)
     for command in COMMANDS:
         typist.watch_until(PROMPT.__eq__)
@@ -231,14 +232,14 @@ def picture(frames: list[Frame]) -> str:
     width, height = round(COLUMNS * WIDTH) + 2 * EDGE, count * HEIGHT + 2 * EDGE
     rules, rows = [], []
     for number in range(count):
-        for index, (row, start, end) in enumerate(_lives(frames, number, whole)):
+        for index, (row, start, end) in enumerate(_row_contents(frames, number, whole)):
             name = f"r{number}-{index}"
             past = end < whole
             shown = [(0.0, "hidden"), (start, "visible"), *([(end, "hidden")] if past else [])]
             steps = "".join(f"{100 * at / whole:.2f}%{{visibility:{how}}}" for at, how in shown)
             rules.append(f"@keyframes {name}{{{steps}}}#{name}{{animation:{name} {whole:.1f}s step-end infinite}}")
             kind = ' class="past"' if past else ""
-            rows.append(f'<g id="{name}"{kind}>{_drawn(row, EDGE + number * HEIGHT)}</g>')
+            rows.append(f'<g id="{name}"{kind}>{_row_svg(row, EDGE + number * HEIGHT)}</g>')
     words = escape("\n".join(plain(frames[-1])))
     moving = "@media (prefers-reduced-motion: no-preference) {\n" + "\n".join(rules) + "\n}\n"
     return (
@@ -248,10 +249,10 @@ def picture(frames: list[Frame]) -> str:
     )
 
 
-def _lives(frames: list[Frame], number: int, whole: float) -> list[tuple[Row, float, float]]:
-    """Return the times at which each content of a row appears and disappears.
+def _row_contents(frames: list[Frame], number: int, whole: float) -> list[tuple[Row, float, float]]:
+    """Return the successive contents of a row, with the times at which each appears and disappears.
 
-    Omit empty contents.
+    The last content disappears at `whole`, which is the length of the recording. Omit empty contents.
     """
     contents: list[tuple[Row, float, float]] = []
     before: Row = ()
@@ -265,8 +266,8 @@ def _lives(frames: list[Frame], number: int, whole: float) -> list[tuple[Row, fl
     return contents
 
 
-def _drawn(row: Row, top: float) -> str:
-    """Return the SVG of a row.
+def _row_svg(row: Row, top: float) -> str:
+    """Return the SVG of a row whose upper edge is at `top`.
 
     Each run of equal attributes has its own position, whatever the width of the font.
     """

@@ -83,7 +83,7 @@ def watch(options: CommonOptions, words: bool, long: bool) -> int:
 
 
 def voices(options: CommonOptions, language: str | None) -> None:
-    """List the engine's voices, or only those for one language."""
+    """Print the engine's voices, or only those for one language."""
     from talkcli.terminal.goals import voice_lines
 
     with options.connect() as client:

@@ -213,7 +213,7 @@ _SERVE_OPTIONS = (
 
 
 def _serve_fault(values: Mapping[str, Any], _: frozenset[str]) -> str | None:
-    """Return an error message if `file:` has no path, or if the player can't use --device."""
+    """Return an error message if --player, --device or --history has an unsuitable value."""
     player = values["player"] or ""
     if values["device"] and player.startswith(("null", "file:")):
         return f"the player {player} has no devices; leave out --device"

@@ -139,7 +139,7 @@ class _TerminalFeedback(Feedback):
         self._paint()
 
     def close(self) -> None:
-        """End the current line, and stop watching the terminal's size."""
+        """Write the current goal's whole text, and stop watching the terminal's size."""
         self._resizes.close()
         if self._line:
             self._write_whole_text(self._line)

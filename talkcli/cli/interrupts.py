@@ -116,7 +116,11 @@ class Interrupts:
             discard_output()
 
     def prepare_cleanup(self) -> None:
-        """Clear the interrupt, so that only a new signal can interrupt the cleanup that follows."""
+        """Let the cleanup wait despite the recorded signal. A second signal ends the process at once.
+
+        The exit code stays the same. If no signal was recorded, a new one ends the wait of the cleanup. Closed output
+        no longer ends a wait.
+        """
         if self.signal_number is not None:
             signal.set_wakeup_fd(-1)  # a second SIGHUP must not interrupt the cleanup
         self.watched.pop(STDOUT_FD, None)

@@ -134,7 +134,7 @@ def _read_input(
 
 
 def replace_and_report_bad_bytes(text: str, options: CommonOptions) -> str:
-    """Replace invalid UTF-8 in a text, and print a message about it unless --quiet is given."""
+    """Return a text with its invalid UTF-8 replaced. Print a message about it unless --quiet is given."""
     text, problem = replace_bad_bytes(text)
     if problem and not options.quiet:
         note(problem)

@@ -98,7 +98,7 @@ def change(options: CommonOptions, **settings: Any) -> int:
 
 
 def pause(options: CommonOptions, seconds: float | None, **_: Any) -> int:
-    """Pause speech on each robot, and print the outcomes. Other options don't work with robots."""
+    """Pause speech on each robot, and print the outcomes. Ignore the other options of `pause`."""
     return _send_request(options, Pause(seconds))
 
 

@@ -123,7 +123,7 @@ class StreamSpeaker(InputSpeaker):
         self._text.ended = not data
 
     def _process_answer(self, exchange: Exchange) -> None:
-        """Read the answer to added text. If the text was refused, report why and stop the goal.
+        """Read the server's answer to added text. After a refusal, print the error and stop the goal.
 
         If the goal has already ended or the connection is lost, only record this.
         """
@@ -136,5 +136,5 @@ class StreamSpeaker(InputSpeaker):
 
 
 def _has_news(goal: GoalHandle, exchange: Exchange | None) -> bool:
-    """Return whether the goal has an event or the request was answered."""
+    """Return whether the goal has a new event or the request was answered."""
     return goal._has_event() or (exchange is not None and exchange.over)

@@ -107,8 +107,8 @@ def connect(socket_option: str | None, interrupt: Mapping[int, int] | None) -> t
     return client, judge_found_server(f"the server is on {client.path} ({by}process {client.server_pid})", before)
 
 
-def _find_refusal(error: TalkError, places: list[SocketPlace]) -> str | None:
-    """Return the line of an error message that says why a client was refused, if any."""
+def _find_cause(error: TalkError, places: list[SocketPlace]) -> str | None:
+    """Return the line of a client's error message that names the cause, or None if none does."""
     lines = error.message.splitlines()
     if not lines[0].startswith(_NO_SERVER_PREFIX):
         return lines[0]
@@ -185,7 +185,7 @@ def explain_missing_server(places: list[SocketPlace], named_by: str | None, erro
     """
     tried = f"{named_by} names" if named_by else "tried:"
     words = f"no server found; {tried} {'; '.join(map(_format_place, places))}"
-    message = _find_refusal(error, places)
+    message = _find_cause(error, places)
     if message is not None and not any(each.state == PLACE_STOPPED for each in places):
         words = f"{words}; {message}"
     return failure("socket", words, _advise_on_missing_server(places, named_by, error.code))

@@ -114,7 +114,10 @@ class Pronunciations:
             self._lengths[pieces[0].lower()].add(len(pieces))
 
     def apply(self, text: str, start: int = 0, end: int | None = None) -> SpokenText:
-        """Return a text, or its part from `start` to `end`, with all terms replaced."""
+        """Replace the terms in a text or a part of it. Return the part as a SpokenText.
+
+        The part begins at the offset `start`. It ends before `end`, or at the end of the text if `end` is None.
+        """
         end, replacements, added = len(text) if end is None else end, [], 0
         for first, last, replacement in self._find(text, start):
             if first >= end or added > MAX_TEXT_CHARS:  # later terms are spoken unchanged

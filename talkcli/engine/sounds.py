@@ -170,7 +170,7 @@ def _refuse_format(path: str, words: str) -> NoReturn:
 
 
 def _read_header(descriptor: int, path: str) -> SoundFile:
-    """Read the header of a WAV file. Raise SoundError if the file can't be played."""
+    """Return the SoundFile that a WAV header describes. Raise SoundError if it can't be played."""
     size, head = os.fstat(descriptor).st_size, os.pread(descriptor, 12, 0)
     if not size:
         _refuse(path, "is empty; copy it again")

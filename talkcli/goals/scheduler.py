@@ -56,7 +56,7 @@ class Now:
 
 @frozen
 class StateChange:
-    """An effect that publishes the new state of a goal."""
+    """An effect that tells clients about a goal's new state."""
 
     record: Record
     state: State
@@ -64,7 +64,7 @@ class StateChange:
 
 @frozen
 class Interruption:
-    """An effect that publishes that one goal interrupts another.
+    """An effect that tells clients about the interruption of a goal by another one.
 
     When the goal continues, a StateChange to ACTIVE follows.
     """
@@ -75,7 +75,7 @@ class Interruption:
 
 @frozen
 class PauseChange:
-    """An effect that publishes that speech was paused or resumed."""
+    """An effect that tells clients about a pause of speech or its end."""
 
     paused: bool
     #: the goal that is being spoken, or None
@@ -608,7 +608,7 @@ class Scheduler:
         record.output = output
 
     def interrupted_at(self, goal_id: str, rest: int, now: Now, gaps: int = 0, gap_seconds: float = 0) -> list[Effect]:
-        """Record that the active goal was interrupted, and start the next goal. Return the effects.
+        """Record where the active goal was interrupted, and start the next goal. Return the effects.
 
         Args:
             goal_id: the id of the goal.
@@ -945,7 +945,7 @@ class Scheduler:
         return self.voices.patience_end(record, self.wanted_voice(record)) if waits else 0.0
 
     def _find_interjection(self, priority: int) -> Record | None:
-        """Return the first waiting interjection of at least this priority that needn't wait for its voice, if any."""
+        """Return the first interjection of at least this priority that needn't wait for its voice, if any."""
         for each in self.pending.interjections():
             if each.say.priority < priority:
                 break

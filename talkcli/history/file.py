@@ -94,9 +94,9 @@ class HistoryWriter:
         self._clock_offset, self._steady_since = math.inf, 0.0
 
     def write(self, goals: Sequence[Goal], damaged_file: FileIdentity | None = None) -> str | None:
-        """Write goals in one transaction, and delete goals that are too old or don't fit.
+        """Write goals, and delete goals that are too old or don't fit. Return a message about any new file.
 
-        If the file was removed or is damaged, start a new one.
+        If the file was removed or is damaged, start a new one. All goals are written in one transaction.
 
         Args:
             goals: the goals, in the order in which they ended.
@@ -150,7 +150,7 @@ class HistoryWriter:
         return message
 
     def _is_clock_steady(self) -> bool:
-        """Check if the clock was set. Return whether it has run long enough since then."""
+        """Return whether the clock has run for `STEADY_CLOCK_S` without being set."""
         now = time.monotonic()
         offset = time.time() - now
         if abs(offset - self._clock_offset) > _CLOCK_TOLERANCE_S:
@@ -180,7 +180,7 @@ class HistoryWriter:
         return f"{self._path} was damaged; it was renamed to {self._path}.damaged, and a new history was started"
 
 
-def search(path: str, condition: str, values: Sequence[object], count: int, end: float) -> list[Row]:
+def search(path: str, condition: str, values: Sequence[object], count: int, deadline: float) -> list[Row]:
     """Return the newest rows that fulfil an SQL condition, oldest first. A missing file has no rows.
 
     Args:
@@ -188,7 +188,7 @@ def search(path: str, condition: str, values: Sequence[object], count: int, end:
         condition: the SQL expression, with placeholders.
         values: the values of the placeholders.
         count: the maximum number of rows.
-        end: the monotonic time at which to give up.
+        deadline: the monotonic time at which to give up.
 
     Raises:
         HistoryError: the file can't be read, or reading takes too long.
@@ -200,10 +200,10 @@ def search(path: str, condition: str, values: Sequence[object], count: int, end:
         uri = f"file:{quote(os.fsencode(path))}?{mode}"
         try:
             with contextlib.closing(sqlite3.connect(uri, timeout=_LOCK_WAIT_S, uri=True)) as connection:
-                connection.set_progress_handler(lambda: time.monotonic() > end, _STEPS_PER_CHECK)
+                connection.set_progress_handler(lambda: time.monotonic() > deadline, _STEPS_PER_CHECK)
                 return connection.execute(query, (*values, count)).fetchall()[::-1]
         except sqlite3.Error as error:
-            if time.monotonic() > end:
+            if time.monotonic() > deadline:
                 raise HistoryError(TimeoutError("the search took too long"), file) from error
             if mode == "immutable=1" or type(error) is sqlite3.DatabaseError or "locked" in str(error):
                 raise HistoryError(error, file) from error

@@ -325,15 +325,15 @@ class Bridge:
             self._descriptor = -1
 
     def _on_ready(self, action: Callable[[Link], None]) -> None:
-        """Call `action` to read from the link or write to it. Then check the link."""
+        """Read from the link or write to it with `action`. Then call `_check_link`."""
         if link := self._link:
             action(link)
             self._check_link(link)
 
     def _check_link(self, link: Link) -> None:
-        """Clean up if the link is broken, and pause all sessions while the broker is slow.
+        """Disconnect if the link is broken or stuck, and pause all sessions while the broker is slow.
 
-        Close the link first if the broker accepts no data. Call this after each use of the link.
+        The link is stuck if the broker accepts no data. Call this after each use of the link.
         """
         if link is not self._link or self._descriptor < 0:
             return

@@ -203,7 +203,7 @@ class Publisher:
         self._publish_event("state", event, encode(event.to_json()))
 
     def _publish_event(self, kind: str, event: Event, line: bytes) -> None:
-        """Publish an event's line, without the goal's texts if they are private or too long. Schedule a status."""
+        """Publish an event, and schedule a status. Leave out texts that are private or too long."""
         shown = self._sessions.with_text and len(line) <= self._sessions.max_payload()
         if isinstance(event, StateChanged) and event.goal and not shown:
             goal = replace(event.goal, **dict.fromkeys(PRIVATE_FIELDS))

@@ -214,7 +214,7 @@ class RemoteSessions:
     # -- from the publisher
 
     def handle_goal_change(self, event: StateChanged, boot: str) -> None:
-        """Record whether a goal is now pending. Schedule a check of waiting goals."""
+        """Record whether a goal is now pending. Schedule an attempt to send goals that wait in the bridge."""
         goal = event.goal
         if event.state is not State.PENDING:
             counted = self.goals.remove(event.id)
@@ -234,7 +234,7 @@ class RemoteSessions:
             self.ids.add(goal.id, boot, user)
 
     def reset_pending(self, pending: tuple[Goal, ...], boot: str) -> None:
-        """Replace the recorded pending goals with the server's. Schedule a check of waiting goals."""
+        """Replace the recorded pending goals. Schedule an attempt to send goals that wait in the bridge."""
         self.goals.replace_pending((each.id, each.key) for each in pending if self.ids.is_counted(each.id, boot))
         self.handle_pending_change()
 

@@ -202,7 +202,7 @@ class RobotConnection(Connection):
         return self._publish(exchange)
 
     def _publish(self, exchange: Exchange) -> bool:
-        """Send a request if the robot isn't absent. Return whether it was sent.
+        """Send a request, unless the robot is absent or a new token is needed. Return whether it was sent.
 
         If a `say` needs a new token, it is sent later. Requests after it wait, too, so that they arrive in order.
         """
@@ -243,7 +243,7 @@ class RobotConnection(Connection):
         return self._token is None or boottime() - self._token[1] > _FRESH_TOKEN_S
 
     def _request_token(self) -> None:
-        """Request a token from the robot, and then send the requests that wait for it."""
+        """Request a token from the robot. When it arrives, send the requests that wait for it."""
         requested_at = boottime()
 
         def on_reply(_reply: JsonObject, _items: list[JsonObject]) -> None:
@@ -255,7 +255,10 @@ class RobotConnection(Connection):
         self._send_now(self._token_request)
 
     def _send_waiting(self, error: TalkError | None) -> None:
-        """Send the requests that have waited for a token. If `error` is given, fail each `say` instead."""
+        """Send all requests that waited for a token. After an error, fail the `say` requests instead.
+
+        `error` says why no token has arrived. It is None if one has.
+        """
         while self._awaiting_token:
             exchange = self._awaiting_token.popleft()
             request = exchange.request
@@ -288,7 +291,7 @@ class RobotConnection(Connection):
     def answer_deadline(self, exchange: Exchange) -> float:
         """Return the time at which an exchange fails if its robot stays silent or absent."""
         if not isinstance(exchange, RobotExchange):
-            return float("inf")  # Lookups have no time limit, because they are sent again after each absence.
+            return float("inf")  # A lookup needs no time limit, because a new one is sent after each absence.
         if self.absent_since is None:
             by = super().answer_deadline(exchange)
         else:
@@ -358,7 +361,7 @@ class RobotConnection(Connection):
                 self.receive(message.payload, time.monotonic())
 
     def _mark_absent(self, why: str, error: type[ServerUnavailable] = ServerUnavailable) -> None:
-        """Mark the robot as absent. Store the reason and the error class to use."""
+        """Mark the robot as absent. Store the reason and the class of the error to raise."""
         self.absence, self._absence_error = why, error
         if self.absent_since is None:
             self.absent_since = time.monotonic()
@@ -487,7 +490,7 @@ class RobotConnection(Connection):
         self._queue_exchange(Exchange(Wait((str(request.id),), request.feedback), on_reply, on_failure), now)
 
     def _queue_exchange(self, exchange: Exchange, now: float) -> None:
-        """Queue a lookup of one or all goals, and send it now unless too many lookups are unanswered."""
+        """Queue a lookup of goals, and send it now unless too many lookups are unanswered."""
         self._lookups.append(exchange)
         self._send_lookups(now)
 

@@ -145,8 +145,13 @@ class FleetRequestCalls:
             await self._close()
             raise
 
-    async def _next_outcome(self, end: float | None, timeout: float | None) -> Outcome | None:
-        """Return the next outcome, or None after the last one. Raise TimeoutError if `end` (monotonic) passes first."""
+    async def _next_outcome(self, deadline: float | None, timeout: float | None) -> Outcome | None:
+        """Return the next outcome, or None after the last one. Raise TimeoutError after the deadline.
+
+        Args:
+            deadline: the monotonic time limit.
+            timeout: the number of seconds to name in the error message.
+        """
         await self._start()
         while not (self._outcomes or self._closed):
             if self._refused is not None:
@@ -159,10 +164,10 @@ class FleetRequestCalls:
                     raise self._no_robot_error()
                 return None
             now = time.monotonic()
-            if end is not None and now >= end:
+            if deadline is not None and now >= deadline:
                 done = len(self) - len(self._unfinished)
                 raise TimeoutError(f"{done} of {len(self)} robots have finished after {round(timeout or 0.0, 1):g} s")
-            await self._desk.poll(min(self._next_check, end or self._next_check) - now, self._interrupt)
+            await self._desk.poll(min(self._next_check, deadline or self._next_check) - now, self._interrupt)
             if time.monotonic() >= self._next_check:
                 await self._check_for_late_robots()
                 self._next_check = time.monotonic() + _CHECK_INTERVAL_S

@@ -158,7 +158,10 @@ class FleetTranscript:
         self._boots: dict[str, str] = {}
 
     def begin(self, robots: Sequence[Presence], broker: str, screen: Screen, now: float) -> list[str]:
-        """Fit the name column to all robots, and return a heading with their number."""
+        """Start the transcript with these robots. Return its heading, which counts them.
+
+        `broker` is the broker's address.
+        """
         for each in robots:
             self._columns.pad_robot(each.name, screen)  # All names must be known first, so that all lines are aligned.
             self._boots[each.name] = _boot_id(each)

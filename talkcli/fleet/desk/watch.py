@@ -297,19 +297,19 @@ class FleetWatch:
         if _identity(before) != _identity(presence):
             self._events.append(RobotChanged(name, before, presence))
 
-    def _report_missed(self, name: str, status: RobotStatus | None, arrived: Container[str | None] = ()) -> None:
+    def _report_missed(self, name: str, status: RobotStatus | None, skip_ids: Container[str | None] = ()) -> None:
         """Report missed events if a robot's status shows goals that haven't been reported.
 
         Args:
             name: the name of the robot.
             status: the status of the robot, or None if unknown.
-            arrived: the ids of goals whose events have already arrived and will be reported later.
+            skip_ids: the ids of goals to leave out, because their events have arrived and will be reported later.
         """
         if status is None:
             return
         events, is_known, presence = status.events(), name in self._reported, self._presences.get(name)
         reported = self._reported.setdefault(name, {})
-        missed = [each for each in events if reported.get(each.state.terminal) != each.id and each.id not in arrived]
+        missed = [each for each in events if reported.get(each.state.terminal) != each.id and each.id not in skip_ids]
         reported.update({each.state.terminal: each.id for each in events})
         if events:  # A bridge that has just started may not know any goals yet.
             self._maybe_missed.discard(name)
@@ -317,7 +317,7 @@ class FleetWatch:
             self._events.append(EventsMissed(RobotInfo(presence, status), tuple(missed)))
 
     def _report(self, robot_event: RobotEvent) -> None:
-        """Report a robot's event. Remember its goal to detect missed events later."""
+        """Report a robot's event. Remember the event's goal to detect missed events later."""
         name, event = robot_event.name, robot_event.event
         if self._selection and name not in self._presences:
             return
