@@ -133,9 +133,9 @@ def test_goals_are_followed_as_one_stream(scripted: Scripted) -> None:
 def test_a_merged_stream_contains_each_pause_once(scripted: Scripted) -> None:
     late, early = (GoalHandle(scripted, Goal(goal_id, State.PENDING)) for goal_id in ("late", "early"))
     pauses = [PausedChanged(paused, None, None, 0.0, n) for n, paused in ((3, True), (5, False), (7, True))]
-    early._listen_to(scripted.listeners, feedback=True, now=0.0)
+    early._listen_to(scripted.listeners, feedback=True, followed_at=0.0)
     scripted.listeners.publish(pauses[0])
-    late._listen_to(scripted.listeners, feedback=True, now=0.0)
+    late._listen_to(scripted.listeners, feedback=True, followed_at=0.0)
     for pause in pauses[1:]:
         scripted.listeners.publish(pause)
     stream = merged([late, early])

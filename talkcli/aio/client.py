@@ -161,7 +161,7 @@ class Client(ClientCalls):
 
     @with_parameters_of(blocking.Client.say)
     def saying(self, *text: str, **options: Any) -> AbstractAsyncContextManager[GoalHandle]:
-        """Return an asynchronous context manager that speaks a text until its block ends.
+        """Return an asynchronous context manager that speaks a text, and cancels the goal when its block ends.
 
         It cancels the goal even if the task is cancelled.
         """
@@ -173,7 +173,7 @@ class Client(ClientCalls):
         return SpeechStream(self._connection, self._stream_request(**options))
 
     def paused(self, seconds: float = PAUSE_S) -> AbstractAsyncContextManager[Goal | None]:
-        """Return an asynchronous context manager that pauses all speech until its block ends.
+        """Return an asynchronous context manager that pauses all speech during its block, up to `seconds`.
 
         Its value is the paused goal, if any.
         """
@@ -184,7 +184,7 @@ class Client(ClientCalls):
         return await self._follow(GoalHandle, ids, feedback=feedback)
 
     async def events(self, *, reconnect: bool = False) -> AsyncIterator[Event]:
-        """Iterate over the events of all goals, starting with the first step of the iteration."""
+        """Iterate over the events of all goals. The client subscribes when the iteration begins."""
         next_event = await self._watch(reconnect=reconnect)
         while True:
             yield await next_event()

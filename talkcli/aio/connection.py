@@ -130,7 +130,7 @@ class LoopConnection(Connection):
         return super().begin(request, on_reply, on_failure)
 
     def wait_until(self, done: Callable[[], bool], deadline: float | None, **options: Any) -> bool:
-        """Process the messages that have arrived. Return whether `done()` is true.
+        """Process the messages that have arrived, without waiting. Return whether `done()` is true.
 
         The deadline must not be in the future.
         """

@@ -49,7 +49,7 @@ def with_parameters_of(
 
 
 class ConnectedClient:
-    """The base class of all clients, which describes the server of a client's connection."""
+    """The base class of all clients, with the socket path and the process id of their server."""
 
     _connection: Connection
 
@@ -166,7 +166,7 @@ class ClientCalls(ConnectedClient):
         return settings if isinstance(settings, dict) else {}
 
     async def pause(self, seconds: float | None = None) -> Goal | None:
-        """Pause all speech, and wait until it has stopped. Return the paused goal, if any."""
+        """Pause all speech for up to `seconds`. Wait until it has stopped, and return the paused goal, if any."""
         return goal_in((await self._ask(Pause(seconds)))[0])
 
     async def resume(self) -> Goal | None:
@@ -274,7 +274,10 @@ class ClientCalls(ConnectedClient):
 
 
 class Saying:
-    """An asynchronous context manager that speaks a text until its block ends. Its value is the goal's handle."""
+    """An asynchronous context manager that speaks a text, and cancels the goal when its block ends.
+
+    Its value is the goal's handle.
+    """
 
     def __init__(self, client: ClientCalls, handle_type: type[GoalCalls], *text: str, **options: Any) -> None:
         """Prepare to speak a text, without sending anything.

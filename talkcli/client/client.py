@@ -35,7 +35,7 @@ __all__ = ["Client", "GoalHandle"]
 
 
 class Client(ConnectedClient):
-    """A connection to a talk server.
+    """A blocking client of a talk server, which reconnects after a break.
 
     The client looks for the server in the same places as the command `talk`. If the connection breaks, for example
     because the server was restarted, the next call reconnects. If the server is still the same process, its goals are
@@ -168,7 +168,7 @@ class Client(ConnectedClient):
 
     @with_parameters_of(say)
     def saying(self, text: str, **options: Any) -> AbstractContextManager[GoalHandle]:
-        """Return a context manager that speaks a text until its block ends.
+        """Return a context manager that speaks a text, and cancels the goal when its block ends.
 
             with talk.saying("please step back") as goal:
                 wait_until_path_is_free()
@@ -380,7 +380,7 @@ class Client(ConnectedClient):
         return run_blocking(self._calls.set(rate, volume, voice, pitch, preempt, ttl))
 
     def pause(self, seconds: float | None = None) -> Goal | None:
-        """Pause all speech, and wait until it has stopped. Return the paused goal, if any.
+        """Pause all speech for up to `seconds`. Wait until it has stopped, and return the paused goal, if any.
 
         Return None if no goal was being spoken. Nothing is spoken until any client calls `resume`. Pausing twice is no
         error.
@@ -394,13 +394,14 @@ class Client(ConnectedClient):
         return run_blocking(self._calls.pause(seconds))
 
     def paused(self, seconds: float = PAUSE_S) -> AbstractContextManager[Goal | None]:
-        """Return a context manager that pauses all speech until its block ends. Its value is the paused goal, if any.
+        """Return a context manager that pauses all speech during its block, for at most `seconds`.
 
             with talk.paused():
                 answer = listen()
 
-        The pause has a connection of its own, and ends with it: at the end of the block, or when the program dies, in
-        any way. Speech continues when all pauses have ended, or when any client calls `resume`.
+        The value of the context is the paused goal, if any. The pause has a connection of its own, and ends with it: at
+        the end of the block, or when the program dies, in any way. Speech continues when all pauses have ended, or when
+        any client calls `resume`.
 
         Args:
             seconds: end the pause after this time, 0.1 to 86,400, in case the program hangs.

@@ -99,7 +99,7 @@ def reach(
 
 
 def _check_owner(connected: _socket.socket) -> None:
-    """Raise AccessDenied if the server belongs to another user."""
+    """Raise AccessDenied unless the server belongs to this user or to root."""
     _, uid = peers.credentials(connected)
     if uid not in {os.getuid(), 0}:
         raise AccessDenied(f"belongs to uid {uid}; to use it anyway, add --socket")
@@ -108,7 +108,7 @@ def _check_owner(connected: _socket.socket) -> None:
 def send_early(
     attempt: ConnectionAttempt, hello: JsonObject, request: JsonObject, before_request: Callable[[], None]
 ) -> ConnectionAttempt | None:
-    """Send the hello message. If the greeting comes at once, send the first request. Return the updated attempt.
+    """Send `hello`, and `request` after an immediate greeting. Return the attempt, or None if it failed.
 
     The request is not sent if the greeting is late or unexpected, or if the server may lack a feature.
 

@@ -54,7 +54,7 @@ def checked_sender_name(name: str | None) -> str | None:
 def event_reader(
     connection: Connection, take: Callable[[], _T], deadline: float | None
 ) -> Callable[[], Coroutine[Any, Any, _T]]:
-    """Return a coroutine function that waits for messages until `take` returns a result, and returns this result.
+    """Return a coroutine function that waits until `take` returns received events, and returns them.
 
     Its result is false if `deadline` has passed or the connection has ended. Nothing more is received after `deadline`,
     so that a loop over the results ends even if the server keeps sending events.
@@ -149,9 +149,9 @@ class Connection(ClientCore):
             self.changed.notify_all()
 
     async def open_another(self) -> Connection:
-        """Open and return another connection to the same server. The server closes it if the program dies.
+        """Return another open connection to the same server. Raise UsageError if a broker is in between.
 
-        Raises UsageError if there is no such connection, because a broker is in between.
+        The server ends such a connection, and its pause, if the program dies.
         """
         raise UsageError("paused() doesn't work over a broker; use pause(seconds=...) instead")
 
@@ -227,9 +227,10 @@ class Connection(ClientCore):
             self.begin(request, on_reply, on_failure)
 
     async def until(self, done: Callable[[], bool], deadline: float | None, *, interruptible: bool = True) -> bool:
-        """Do the same as `wait_until`, as a coroutine.
+        """Wait until `done()` is true. Return False at the deadline or the connection's end.
 
-        A connection that runs in an event loop suspends the coroutine. Other connections block.
+        The arguments are those of `wait_until`. A connection that runs in an event loop suspends the coroutine. Other
+        connections block.
         """
         return self.wait_until(done, deadline, interruptible=interruptible)
 
@@ -332,7 +333,7 @@ class Connection(ClientCore):
         raise NotImplementedError
 
     def prepare(self, now: float) -> tuple[dict[int, int], float]:
-        """Send waiting requests and reconnect, if possible without blocking. Return what to wait for.
+        """Send requests and reconnect as far as possible without blocking. Return what to wait for next.
 
         Returns:
             The poll events by descriptor, and the monotonic time at which to call `process` even if nothing is ready.

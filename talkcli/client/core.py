@@ -161,7 +161,7 @@ class EventListeners:
                 self.watches.discard(buffer)
 
     def publish(self, event: Event | None) -> None:
-        """Pass an event to all its receivers.
+        """Pass an event to its receivers. After a Result, stop following its goal.
 
         Events of an unknown kind are None, and are ignored.
         """
@@ -202,11 +202,11 @@ class TrackedGoal:
         self._with_feedback = False
         self._buffer = EventBuffer()
 
-    def _set_request(self, request: Say, now: float) -> None:
+    def _set_request(self, request: Say, sent_at: float) -> None:
         """Set the goal's id and text from a `say` request, before the server answers."""
         self.goal = replace(self.goal, id=request.id or "", text=request.text)
         if request.wait:
-            self._followed_at = now
+            self._followed_at = sent_at
 
     def _accept(self, reply: JsonObject) -> None:
         """Update the goal from the server's reply to `say`."""
@@ -216,11 +216,11 @@ class TrackedGoal:
         self.pause = {name: value for name, value in reply.items() if name.startswith("paused")}
         self._adds_text = self.goal.more
 
-    def _listen_to(self, listeners: EventListeners, *, feedback: bool, now: float) -> None:
-        """Register with `listeners` to receive the goal's events."""
+    def _listen_to(self, listeners: EventListeners, *, feedback: bool, followed_at: float) -> None:
+        """Register with `listeners` to receive the goal's events, unless the goal has ended."""
         self._with_feedback = self._with_feedback or feedback
         if self._followed_at is None:
-            self._followed_at = now
+            self._followed_at = followed_at
         if not self.goal.state.terminal:
             listeners.add(self)
 
@@ -697,11 +697,11 @@ class ClientCore:
     # -- disconnecting and reconnecting
 
     def break_off(self, why: str, now: float) -> None:  # noqa: ARG002 - for subclasses that reconnect
-        """End a faulty connection for good. Subclasses may reconnect instead."""
+        """Record that a faulty connection has ended for good. Subclasses may reconnect instead."""
         self.end(why)
 
     def end(self, why: str) -> None:
-        """End the connection for good, and fail all unanswered requests.
+        """Record that the connection has ended for good, and fail all unanswered requests.
 
         Received events can still be read.
         """

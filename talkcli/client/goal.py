@@ -121,7 +121,7 @@ class GoalCalls(TrackedGoal):
 
         The caller must hold the connection's lock.
         """
-        self._listen_to(self._connection.listeners, feedback=feedback, now=time.monotonic())
+        self._listen_to(self._connection.listeners, feedback=feedback, followed_at=time.monotonic())
 
     async def _follow(self, *, feedback: bool) -> None:
         """Ask the server for the goal's events, unless it already sends them."""
@@ -215,9 +215,9 @@ class GoalHandle(GoalCalls):
         """
         return run_blocking(self._cancel())
 
-    def _iterate_events(self, end: float | None, timeout: float | None) -> Iterator[Event]:
-        """Yield the goal's events up to the Result. Raise TimeoutError if `end` (monotonic) passes first."""
-        read, event = event_reader(self._connection, self._take, end), None
+    def _iterate_events(self, deadline: float | None, timeout: float | None) -> Iterator[Event]:
+        """Yield the goal's events up to the Result. After `deadline`, raise a TimeoutError that names `timeout`."""
+        read, event = event_reader(self._connection, self._take, deadline), None
         while not isinstance(event, Result):
             event = run_blocking(self._read_event(read, timeout))
             yield event

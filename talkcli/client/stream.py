@@ -118,7 +118,7 @@ class StreamCalls:
                 await self._connection.request(Append(self._goal_id, broken=True))
 
     def _process_error(self, error: TalkError) -> bool:
-        """Drop refused text, or stop adding text to the goal. Return whether the goal accepts other text."""
+        """Drop refused text, or end a lost goal as LOST. Return whether the goal accepts other text."""
         assert self.goal
         if isinstance(error, RequestRefused) and error.code == "goal_ended":
             self._refused = True

@@ -98,7 +98,7 @@ class History:
         self._write()  # find errors before the first goal ends
 
     def add(self, goal: Goal) -> None:
-        """Add an ended goal, to be written soon. If too many goals wait, drop the oldest."""
+        """Queue an ended goal for writing. If too many goals wait, drop the oldest."""
         self._unwritten.append(goal if self.with_text else without_text(goal))
         if len(self._unwritten) > MAX_UNWRITTEN_GOALS:
             self._unwritten.popleft()
@@ -178,7 +178,7 @@ class History:
         self._call_in_loop(partial(self._handle_written, replaced, error))
 
     def _handle_written(self, replaced: str | None, error: str | None) -> None:
-        """Keep the goals if writing has failed. Log new errors, and schedule the next write."""
+        """Remove the written goals, or keep them after an error. Log a new error, and schedule the next write."""
         for _ in range(0 if error else self._writing or 0):
             self._unwritten.popleft()
         self._writing, former, self._error = None, self._error, error

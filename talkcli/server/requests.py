@@ -169,7 +169,7 @@ class Requests:
         return False
 
     def _schedule_room_check(self) -> None:
-        """Schedule a check of the goals that wait for room in the queue, if there are any."""
+        """If goals wait for room in the queue, schedule a call that submits those that fit."""
         if self._speech.waiting_for_room and self._room_check is None:
             # Check in the next iteration of the event loop, because the caller may not have finished its changes.
             self._room_check = asyncio.get_running_loop().call_soon(self._submit_waiting_goals)
@@ -456,9 +456,9 @@ class Requests:
         pending.answer(_goal_items("goal", records), count=len(records))
 
     def _history_items(self, pending: PendingRequest, rows: list[Row], held_bytes: int) -> Iterator[JsonObject]:
-        """Yield an object for each row of the history. Goals that are still in memory have their texts.
+        """Yield an object for each row of the history. Then stop counting `held_bytes` as held output.
 
-        `held_bytes` are counted as held output until all objects are sent.
+        Goals that are still in memory have their texts.
         """
         for row in rows:
             goal = row_to_json(row)

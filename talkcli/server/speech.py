@@ -302,7 +302,7 @@ class Speech:
         return following is not None, following is not None and is_neural(self.scheduler.wanted_voice(following))
 
     def _publish_change(self, record: Record, state: State, at: float) -> None:
-        """Publish a goal's new state. If the goal has ended, log the end and resume the requests that wait for it."""
+        """Publish a goal's new state. Log and store an ended goal, and resume the requests that wait for it."""
         self.subscribers.state_changed(record, state, at)
         if state.terminal:
             if self.history:
@@ -384,7 +384,7 @@ class Speech:
         self._loop.call_soon(self._process_reports)
 
     def _process_report(self, report: Report) -> None:
-        """Process one report from the engine."""
+        """Pass a report to the method for its kind. Ignore reports about goals that are no longer active."""
         now, active = self.advance_time(), self.scheduler.active
         if isinstance(report, protocol.GoalEvent):
             if active and active.id == report.id:  # reports about a goal that is no longer active are ignored
@@ -395,7 +395,7 @@ class Speech:
             self._process_engine_event(report, now)
 
     def _process_goal_event(self, event: protocol.GoalEvent, active: Record, now: Now) -> None:
-        """Process a report about the active goal."""
+        """Update the active goal from a report of the engine, and notify the goal's clients."""
         scheduler = self.scheduler
         match event:
             case protocol.TextMissing():
@@ -428,7 +428,7 @@ class Speech:
                     resume_all(self.waiting_for_silence[active])
 
     def _process_voice_event(self, event: protocol.VoiceEvent, now: Now) -> None:
-        """Process a report about a voice, or the engine's list of voices."""
+        """Store the engine's list of voices, or tell the scheduler that a voice was loaded or unloaded."""
         scheduler = self.scheduler
         match event:
             case protocol.VoiceList():
@@ -444,7 +444,7 @@ class Speech:
                 self.apply(scheduler.voice_unloaded(event.voice, now))
 
     def _process_engine_event(self, event: Report, now: Now) -> None:
-        """Process a report about the engine itself."""
+        """Record that the engine is ready or has failed, or log a line of its standard error."""
         match event:
             case protocol.Ready():
                 self._handle_ready(event, now)
@@ -465,7 +465,7 @@ class Speech:
                     self.apply(self.scheduler.failed(active.id, Reason.ENGINE_FAILED, event.message, None, now))
 
     def _end_active_goal(self, ended: protocol.Ended, active: Record, now: Now) -> None:
-        """End the active goal after the engine has reported its end."""
+        """End or interrupt the active goal after the engine has reported its end."""
         scheduler = self.scheduler
         if self.ready and ended.player:  # `status` shows the player that was used
             self.ready = replace(self.ready, player=ended.player)

@@ -113,7 +113,7 @@ def say(core: ClientCore, now: float = 0.0, **options: Any) -> TrackedGoal:
 
     def on_reply(reply: JsonObject, _: list[JsonObject]) -> None:
         tracked._accept(reply)
-        tracked._listen_to(core.listeners, feedback=request.feedback, now=now)
+        tracked._listen_to(core.listeners, feedback=request.feedback, followed_at=now)
 
     submit(core, request, now, on_reply=on_reply, on_failure=tracked._fail)
     return tracked
@@ -175,7 +175,7 @@ def test_requests_are_numbered_and_sent_in_order(core: ClientCore) -> None:
 
 def test_items_belong_to_their_reply_and_replies_may_come_out_of_order(core: ClientCore) -> None:
     tracked = TrackedGoal(Goal("g", State.PENDING))
-    tracked._listen_to(core.listeners, feedback=False, now=0.0)
+    tracked._listen_to(core.listeners, feedback=False, followed_at=0.0)
     heard: list[object] = []
 
     def on_reply(reply: JsonObject, items: list[JsonObject]) -> None:

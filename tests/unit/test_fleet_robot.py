@@ -63,7 +63,7 @@ def begin_text(robot: RobotConnection, desk: Desk, goal_id: str) -> TrackedGoal:
     answer(robot, desk, goal=reply["goal"])
     tracked = TrackedGoal(Goal("", State.PENDING))
     tracked._accept(reply)
-    tracked._listen_to(robot.listeners, feedback=False, now=0.0)
+    tracked._listen_to(robot.listeners, feedback=False, followed_at=0.0)
     return tracked
 
 

@@ -214,7 +214,7 @@ class GrowingText:
 
 
 def _required_wait(text: str, start: int, mark: re.Match[str]) -> int:
-    """Return the minimum wait for more text before a sentence may end at a mark.
+    """Return the constant for the minimum wait before a sentence may end at a mark.
 
     The sentence begins at `start`, and `mark` is a match of `_SENTENCE_END`. The result is one of the constants
     such as `_SHORT_WAIT`.
@@ -239,7 +239,7 @@ def _required_wait(text: str, start: int, mark: re.Match[str]) -> int:
 
 
 def _required_abbreviation_wait(text: str, next_start: int, kind: str) -> int:
-    """Return the minimum wait for more text before a sentence may end at an abbreviation.
+    """Return the constant for the minimum wait before a sentence may end at an abbreviation.
 
     `next_start` is the offset of the text after it, and `kind` is the name of its group in `_ABBREVIATION`.
     """

@@ -669,7 +669,7 @@ class Playback:
     # -- holding
 
     def _keep_silent(self, feed: PlayerFeed) -> None:
-        """Play silence until the pause ends, and confirm the pause to the server.
+        """Confirm the pause, and play silence until it ends. In a long pause, release the player.
 
         Raises:
             _PlayerReleased: the player failed, or the pause is longer than `RELEASE_DELAY_S`.
@@ -788,7 +788,7 @@ class Playback:
             self._end_early(self._runner.word_end_due - time.monotonic())
 
     def _end_early(self, time_left: float) -> None:
-        """If the current word can end now, cut off the samples after it, and raise EndedEarly.
+        """If the current word's end is known or no time is left, cut off the rest, and raise EndedEarly.
 
         Do nothing if the next word isn't known yet, or if it begins too late. `time_left` is the time in seconds in
         which the current word must end. After that, the word is cut off.

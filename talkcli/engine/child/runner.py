@@ -152,7 +152,7 @@ class ActiveGoal:
         return self._markdown.read(text, ended=ended) if self._markdown else text
 
     def speech_seconds(self, now: float) -> float:
-        """Return how many seconds a third-party driver has spoken, without pauses."""
+        """Return how many seconds a third-party driver has spoken the goal, not counting pauses."""
         return self.spoken_s + (now - self.resumed_at if self.with_driver else 0.0)
 
 
@@ -435,7 +435,7 @@ class GoalRunner:
             self._fail_goal(Reason.NOTHING_TO_SAY, "nothing in the text can be spoken")
 
     def _step_driver(self, goal: ActiveGoal) -> None:
-        """Run one step of the driver. Fail the goal if the driver has dropped its text.
+        """Run one step of the driver. If the driver has dropped the goal's text, fail the goal.
 
         `talk`'s own driver speaks the whole text in one step. A third-party driver needs many steps.
         """

@@ -136,7 +136,7 @@ def render(
 
 
 def split_into_pieces(text: str) -> Iterator[str]:
-    """Split a text into pieces of limited length, if possible after a sentence or a word."""
+    """Split a text into pieces of limited length, preferably between sentences or words."""
     start = 0
     while len(text) - start > MAX_PIECE_CHARS:
         limit = start + MAX_PIECE_CHARS

@@ -353,7 +353,7 @@ class Supervisor:
                 self._fail_goal(self._goal, Reason.NOT_SILENT, message)
 
     def _handle_readable(self, process: EngineProcess, descriptor: int) -> None:
-        """Read from a descriptor of a process, or clean up if the process has ended."""
+        """Read from a process's descriptor. If the process has ended, retry or end its goal, and release it."""
         if descriptor == process.liveness:
             if process is self._process:
                 self._receive(process)  # read the last messages of the process before handling its death
@@ -507,7 +507,7 @@ class Supervisor:
         self._kill_process(f"the engine crashed: {process.reap()}", Reason.ENGINE_CRASHED)
 
     def _handle_event(self, process: EngineProcess, event: protocol.Event) -> None:
-        """Record an event of the current goal. Post any other event, and send the waiting goal if possible."""
+        """Handle a goal's event. Post any other event, and send the waiting goal if the process is ready."""
         self._last_sign_at = time.monotonic()
         if isinstance(event, protocol.GoalEvent):
             goal = self._current_goal(event.id)

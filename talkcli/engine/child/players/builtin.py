@@ -244,7 +244,7 @@ def _open_regular_file(path: str) -> int:
 
 
 def saved_rate(path: str) -> int | None:
-    """Return the sample rate of a WAV file written by `WavPlayer`, or None if there is no such file."""
+    """Return the sample rate of a WAV file, or None if it has none. Create the file if it is missing."""
     try:
         file = _open_regular_file(path)
     except (CannotSpeak, OSError):

@@ -77,7 +77,7 @@ class HandoverTimes:
         return min(MAX_CUT_S, measured[len(measured) // 2]) if measured else 0.0
 
     def sentence_ended(self, player_name: str, last_sample_at: float) -> None:
-        """Record the time of a completed sentence's last sample."""
+        """If another goal is waiting, record the time of the completed sentence's last sample."""
         self._previous = (player_name, last_sample_at) if self.next_waits else None
 
     def sentence_started(self, player_name: str, at: float, *, neural: bool = False) -> None:

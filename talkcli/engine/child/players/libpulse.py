@@ -203,7 +203,7 @@ class MainLoop:
         self.freed, self.interests, self.wake_at = True, [], NEVER
 
     def _poll(self, wanted: Any, count: int, timeout: int, _: object) -> int:
-        """Poll libpulse's descriptors without waiting. Store them and the time of libpulse's next timer."""
+        """Return how many descriptors are ready now. Store the descriptors and the time of the next timer."""
         self.interests = [(wanted[number].fd, wanted[number].events) for number in range(count)]
         self.wake_at = NEVER if timeout < 0 else time.monotonic() + timeout / 1000
         return max(0, int(self._library.poll(wanted, count, 0)))  # libpulse would abort the process after an error

@@ -190,8 +190,8 @@ class Espeak:
         # up to a third.
         self._parameters.clear()
         if not voice or self._espeak.SetVoiceByName(voice.encode("utf-8", "replace")) != self._espeak.EE_OK:
-            # Even after an error, the library has switched to the new voice. If a file of that voice is missing, the
-            # library would be silent, so switch back.
+            # The library has switched to the new voice even though it reports an error. Switch back, because a voice
+            # with a missing file is silent.
             self._espeak.SetVoiceByName(self.voice.encode())
             raise UnknownVoice("one of its files is missing")
         self.voice = voice

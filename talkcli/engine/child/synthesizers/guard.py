@@ -52,8 +52,8 @@ _SYMBOL_LETTERS = frozenset(map(chr, (*range(0x2460, 0x2500), *range(0x2800, 0x2
 _CLAUSE_END = re.compile(r"[.,;:!?…](?:[\s()\[\]{}<>\"«»“”‘’„]|\Z)|[。、，！？：；︒؟،؛।॥։՝]|\n\s*\n")
 #: Matches a hyphen between a symbol and a letter.
 _HYPHEN = re.compile(r"(?<=[^\w\s]|_)-(?=[^\W\d_])")
-#: The library treats the first of these characters, and every character with a higher code, as a separate word. The
-#: other two are the first and the last Hangul syllable. The library splits each syllable into letters of three bytes.
+#: The library treats every character from U+2E80 upwards as a separate word. The other two are the first and the last
+#: Hangul syllable. The library splits each syllable into letters of three bytes.
 _IDEOGRAPHS, _HANGUL, _HANGUL_END = "\u2e80", "\uac00", "\ud7a3"
 #: Characters that crash all voices except those of the given languages. If a voice doesn't know a character, the
 #: library loads the default language of its script. If that language has no name for the character, the library loads
