@@ -72,7 +72,7 @@ _NEEDED_FEATURES = (
     ("WildcardSubscriptionAvailable", 0xA2, "wildcards in subscriptions"),
 )
 _SUITABLE_BROKER = "use another broker, such as mosquitto 1.6 or later"
-_IF_NO_MQTT_5 = f"{_SUITABLE_BROKER}, if this one doesn't support MQTT 5"
+_CHECK_MQTT_5 = "check that the broker supports MQTT 5, as mosquitto 1.6 or later does"
 REASON_FAILURE, REASON_NOT_AUTHORIZED = 0x80, 0x87
 #: Name of the MQTT user property that contains a robot's token.
 _TOKEN_PROPERTY = "talk-token"
@@ -330,10 +330,10 @@ class Link:
             which = "the certificate of this client" if self._broker.cert else "a client without a certificate"
             words = f"the broker at {url} rejected {which}: {why}"
             remedy = "set TALK_MQTT_CERT and TALK_MQTT_KEY to a certificate that it accepts"
-            return AccessDenied(f"{words}; {remedy}" if self._alert else f"{words}; {remedy}, or {_IF_NO_MQTT_5}")
+            return AccessDenied(f"{words}; {remedy}" if self._alert else f"{words}; {remedy}, or {_CHECK_MQTT_5}")
         if answer is None:
             why = f"did not answer: {self.ended}" if self.ended else f"did not answer within {LOGIN_LIMIT_S:g} s"
-            return ServerUnavailable(f"the broker at {url} {why}; {_IF_NO_MQTT_5}")
+            return ServerUnavailable(f"the broker at {url} {why}; {_CHECK_MQTT_5}")
         who = "an anonymous user" if self._broker.user is None else f"'{printable(self._broker.user)}'"
         if is_denied(answer.value) and answer.value not in _REASONS_LOGIN_DENIED and self._has_will:
             # The broker rejects the topic of the will.

@@ -54,7 +54,7 @@ def scripted_broker(first: bytes) -> Iterator[tuple[Broker, list[socket.socket]]
 @pytest.mark.parametrize(
     ("answer", "error", "words"),
     [
-        (b"", ServerUnavailable, "such as mosquitto 1.6 or later, if this one doesn't support MQTT 5"),
+        (b"", ServerUnavailable, "check that the broker supports MQTT 5, as mosquitto 1.6 or later does"),
         (b"\x20\x02\x00\x01", ProtocolMismatch, "does not support MQTT 5"),  # the answer of MQTT 3.1.1
         (login(0x84), ProtocolMismatch, "does not support MQTT 5"),
         (login(0x9A), ProtocolMismatch, "does not support retained messages"),
