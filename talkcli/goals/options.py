@@ -397,8 +397,8 @@ OPTIONS = (
         setting=Setting(
             False,
             meaning="whether goals that were sent without `preempt` interrupt the current goal",
-            set_help="Choose whether new sentences interrupt the current one. 'talk say --queue' always waits.",
-            serve_help="Let new sentences interrupt the current sentence. 'talk say --queue' always waits.",
+            set_help="Choose whether new sentences interrupt the current one. With 'talk say --queue', they wait.",
+            serve_help="Let new sentences interrupt the current sentence. With 'talk say --queue', they wait.",
             flags="--preempt/--no-preempt",
             words="new goals interrupt",
             none_words="new goals wait",
@@ -716,7 +716,7 @@ class Pause:
             "end the pause when this connection ends",
             default=False,
             special_flags="--while",
-            help="Run COMMAND, and end the pause when it ends.",
+            help="Run COMMAND, and end the pause when COMMAND ends.",
         ),
     )
     seconds: float | None = None

@@ -159,7 +159,7 @@ class _Graph:
 
     def __init__(self, reader: _Reader, raw: Buffer, depth: int = 0) -> None:
         if depth > _MAX_NESTED_GRAPHS:
-            raise NotSplit(f"has graphs that are nested more than {_MAX_NESTED_GRAPHS} deep")
+            raise NotSplit(f"has graphs that are nested more than {_MAX_NESTED_GRAPHS} levels deep")
         fields = reader.fields(raw)
         if any(number == _SPARSE_INITIALIZER for number, _, _ in fields):
             raise NotSplit("has sparse weights, unlike any Piper model")
