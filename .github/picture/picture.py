@@ -76,7 +76,7 @@ class Screen:
         self._attributes = ""
 
     def draw(self, text: str) -> None:
-        """Draw the program's output."""
+        """Update the screen with output of the shell."""
         for part in re.finditer(r"\x1b\[\??([0-9;]*)([A-Za-z])|(.)", text, re.DOTALL):
             if part[3] is None:
                 self._control(part[1], part[2])

@@ -72,7 +72,7 @@ def _watch(options: CommonOptions, broker: Broker, selection: Selection | None, 
 
 
 def _show_event(
-    options: CommonOptions, broker: Broker, transcript: FleetTranscript, event: FleetEvent, output: Screen
+    options: CommonOptions, broker: Broker, transcript: FleetTranscript, event: FleetEvent, screen: Screen
 ) -> None:
     """Print an event of the fleet.
 
@@ -84,17 +84,17 @@ def _show_event(
     if isinstance(event, FleetSnapshot):
         robots = [each.presence for each in event.robots]
         objects = (_snapshot_object(each) for each in event.robots)
-        show_result(options, objects, lambda: transcript.begin(robots, broker.url, output, now))
+        show_result(options, objects, lambda: transcript.begin(robots, broker.url, screen, now))
     elif isinstance(event, RobotChanged):
         message: JsonObject = {"robot": event.name, "event": "presence", "presence": event.now and event.now.to_json()}
         robot = event.now or Presence(event.name, online=False)
-        show_result(options, [message], lambda: transcript.change_lines(event.before, robot, output, now))
+        show_result(options, [message], lambda: transcript.change_lines(event.before, robot, screen, now))
     elif isinstance(event, RobotEvent):
         message = {"robot": event.name, **event.message}
-        show_result(options, [message], lambda: transcript.lines(event.name, event.event, output, now))
+        show_result(options, [message], lambda: transcript.lines(event.name, event.event, screen, now))
     elif isinstance(event, EventsMissed):
         name = event.robot.presence.name
-        lines = (line for each in event.events for line in transcript.lines(name, each, output, now))
+        lines = (line for each in event.events for line in transcript.lines(name, each, screen, now))
         show_result(options, [_snapshot_object(event.robot)], lambda: lines)
     elif not options.quiet:
         if isinstance(event, BrokerAway):

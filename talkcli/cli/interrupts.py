@@ -102,9 +102,10 @@ class Interrupts:
         return kind is Interrupted
 
     def handle_error(self, error: Interrupted | OSError) -> None:
-        """Discard the output if its reader is gone. Re-raise errors other than interrupts or timeouts.
+        """Discard the output if its reader is gone. Re-raise unexpected errors.
 
-        Record in `reader_gone` whether the reader is gone.
+        Interrupts, timeouts and failed writes to a missing reader are expected. Record in `reader_gone` whether the
+        reader is gone.
         """
         if isinstance(error, Interrupted | TimeoutError):
             self.reader_gone = STDOUT_FD in self.watched and not has_reader()

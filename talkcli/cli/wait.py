@@ -72,8 +72,6 @@ class GoalReporter:
     def follow(self, goals: Sequence[GoalHandle], timeout: float | None) -> None:
         """Show the events of goals until the goals have ended.
 
-        Raise TimeoutError if they don't end in time.
-
         Raises:
             TimeoutError: the goals haven't ended in time.
             Interrupted: the wait was interrupted.

@@ -372,7 +372,7 @@ def _advise_on_tls_error(broker: Broker, message: str, verify_code: int, now: fl
 def judge_login(broker: Broker, refusal: str | None) -> Finding:
     """Create the finding for a login. The login succeeded if `refusal` is None.
 
-    `refusal` is the broker's reason for refusing it, or None.
+    `refusal` says why the broker refused the login.
     """
     if refusal is not None:
         wrong, _, remedy = refusal.partition("; ")
@@ -430,7 +430,7 @@ def judge_unknown_robot(robot: str, known_robots: list[str], user: str, *, has_o
 
 
 def judge_rights(user: str, unwritable: tuple[str, ...], unreadable: tuple[str, ...], error: str | None) -> Finding:
-    """Check the user's access rights to the broker's topics. Return the finding.
+    """Create the finding for a test of the user's access rights.
 
     Args:
         user: the user's name.

@@ -291,7 +291,7 @@ def homeassistant_device(name: str, allow: Collection[str], version: str) -> Mes
 
 
 def _component(platform: str, name: str | None, icon: str, **keys: object) -> JsonObject:
-    """Return a component of the device with these keys."""
+    """Return a component of a Home Assistant device, with these keys."""
     return {"platform": platform, "name": name, "icon": f"mdi:{icon}", "qos": 1, **keys}
 
 

@@ -886,31 +886,31 @@ def is_visible(text: str) -> bool:
     return any(unicodedata.category(each) not in _SILENT_CATEGORIES for each in text)
 
 
-def bad_characters(text: str, max_chars: int | None, before_chars: int = 0) -> Refusal | None:
+def bad_characters(text: str, max_chars: int | None, text_offset: int = 0) -> Refusal | None:
     """Return a reason and a message if a text is too long or has forbidden characters.
 
     Args:
         text: the text.
         max_chars: the maximum number of characters, or None for no limit.
-        before_chars: the length of the earlier parts of a growing text, which counts, too.
+        text_offset: the length of the earlier parts of a growing text, which counts, too.
 
     Returns:
         None if the characters are allowed.
     """
     from talkcli.goals.reasons import Reason
 
-    count = before_chars + len(text)
+    count = text_offset + len(text)
     if max_chars is not None and count > max_chars:
         return Reason.TEXT_TOO_LONG, f"the text is too long: {count:,} characters (at most {max_chars:,})"
     try:
         size = len(text.encode())
     except UnicodeEncodeError as error:
-        words = f"the text is not valid Unicode: character {before_chars + error.start + 1} is half of a surrogate pair"
+        words = f"the text is not valid Unicode: character {text_offset + error.start + 1} is half of a surrogate pair"
         return Reason.INVALID_TEXT, words
     if max_chars is not None and size > MAX_TEXT_BYTES:
         return Reason.TEXT_TOO_LONG, f"the text is too long: {size:,} bytes (at most {MAX_TEXT_BYTES:,})"
     if "\0" in text:
-        place = before_chars + text.index("\0") + 1
+        place = text_offset + text.index("\0") + 1
         return Reason.INVALID_TEXT, f"the text contains a NUL character (character {place:,})"
     return None
 

@@ -1014,7 +1014,7 @@ class Scheduler:
         return self._end_unqueued(record, reason, details, by, now)
 
     def _end_unqueued(self, record: Record, reason: Reason, details: str, by: By | None, now: Now) -> list[Effect]:
-        """End a pending goal as RECALLED after it has left the queue. Return the effects."""
+        """End a pending goal that isn't in the queue as RECALLED. Return the effects."""
         record.change_state(State.RECALLING)
         return self._end(record, State.RECALLED, reason, f"not spoken: {details}", by, now)
 
@@ -1050,7 +1050,7 @@ class Scheduler:
     def _end(
         self, record: Record, state: State, reason: Reason | None, message: str, by: By | None, now: Now
     ) -> list[Effect]:
-        """End a goal in this state, move it to the recent goals, and start the next one. Return the effects."""
+        """End a goal, and store it as recent. If it was active, start the next goal. Return the effects."""
         record.change_state(state)
         record.reason, record.message, record.by = reason, message, by
         record.ended_at, record.paused, record.more, record.waits = now.wall, False, False, False

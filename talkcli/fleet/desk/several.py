@@ -377,9 +377,7 @@ class FleetRequest(FleetRequestCalls):
         return self.results()
 
     def results(self, timeout: float | None = None) -> Iterator[Outcome]:
-        """Yield the outcomes as they arrive.
-
-        Raises TimeoutError if some are missing after `timeout` seconds.
+        """Yield the outcomes as they arrive. Raise TimeoutError if some are missing after `timeout` seconds.
 
         After a TimeoutError or Interrupted, call this again to receive the remaining outcomes.
 
