@@ -12,7 +12,7 @@ import pytest
 from talkcli.terminal.text import width
 from tests.conformance.bareserve import TALK
 from tests.support.processes import Talk
-from tests.support.terminal import Terminal
+from tests.support.screen import Terminal
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -112,21 +112,6 @@ def test_a_result_received_before_the_server_disconnects_counts() -> None:
         assert handle.wait(5).state is State.PREEMPTED
 
 
-def test_a_goal_is_lost_if_the_server_disconnects() -> None:
-    def play(peer: Peer) -> None:
-        peer.accept()
-        peer.send(peer.state("ACTIVE"), peer.word())
-        peer.hang_up()
-
-    with serving(play) as path, Client(path, timeout=0.3) as client:
-        handle = client.say("a", feedback=True)
-        assert len(list(handle.feedback(5))) == 1
-        assert handle.wait(5) is handle.goal
-        assert (handle.state, handle.goal.reason) == (State.LOST, "lost")
-        assert "may still be spoken" in str(handle.goal.message)
-        assert [event for event in handle.events() if isinstance(event, Result)] == [Result(handle.goal)]
-
-
 @pytest.fixture
 def interrupt() -> Iterator[tuple[int, int]]:
     """A pipe that interrupts the client: its reading end and its writing end."""

@@ -18,8 +18,8 @@ from talkcli import Client, __version__, cli
 from talkcli.cli.commands import COMMANDS
 from tests.conformance.bareserve import TALK, alone, run
 from tests.conformance.rawsocket import GREETING, FakeServer
+from tests.support.screen import Terminal
 from tests.support.surroundings import clean_environment, short_directory
-from tests.support.terminal import Terminal
 
 if TYPE_CHECKING:
     from tests.support.processes import Talk

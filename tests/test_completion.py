@@ -20,8 +20,8 @@ from tests.conformance.rawsocket import GREETING, FakeServer
 from tests.golden import surface
 from tests.readme.blocks import block
 from tests.support.connection import PATIENCE
+from tests.support.screen import Terminal
 from tests.support.surroundings import needs, short_directory
-from tests.support.terminal import Terminal
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:

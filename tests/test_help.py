@@ -19,8 +19,8 @@ from talkcli.engine import players
 from talkcli.goals import states
 from tests.conformance.bareserve import TALK, alone, environment, run
 from tests.golden import surface
+from tests.support.screen import Terminal
 from tests.support.surroundings import short_directory
-from tests.support.terminal import Terminal
 
 if TYPE_CHECKING:
     import pathlib

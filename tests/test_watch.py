@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from talkcli.terminal.text import width
 from tests.conformance.bareserve import TALK
-from tests.support.terminal import Terminal
+from tests.support.screen import Terminal
 
 if TYPE_CHECKING:
     from tests.support.processes import Talk

@@ -15,7 +15,7 @@ from tests.support.bridge import Desk
 from tests.support.connection import PATIENCE
 from tests.support.mqtt import Listener
 from tests.support.ports import Port
-from tests.support.terminal import Terminal
+from tests.support.screen import Terminal
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

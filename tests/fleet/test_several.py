@@ -17,7 +17,7 @@ from tests.fleet.robot import LONG
 from tests.support.bridge import Desk
 from tests.support.connection import PATIENCE
 from tests.support.mqtt import Listener
-from tests.support.terminal import Terminal
+from tests.support.screen import Terminal
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:

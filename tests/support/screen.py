@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
 _CONTROL = re.compile(r"\x1b\[(?P<numbers>[0-9;]*)(?P<letter>[A-Za-z])")
+_COLOUR = re.compile("\x1b\\[[0-9;]*m")
 _IN_A_TERMINAL = (
     "import fcntl, os, sys, termios; os.setsid(); fcntl.ioctl(1, termios.TIOCSCTTY, 0);"
     "os.execvp(sys.argv[1], sys.argv[1:])"
@@ -120,6 +121,28 @@ class Terminal:
         os.close(terminal)
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
+
+    def __enter__(self) -> Terminal:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()
+
+    @property
+    def text(self) -> str:
+        """The output so far, without colours and the terminal's wrapping. It may contain text that can't be drawn."""
+        return _COLOUR.sub("", self.raw.decode(errors="ignore")).replace("\r\n", "\n")
+
+    @property
+    def lines(self) -> list[str]:
+        return self.text.split("\n")[:-1]
+
+    def wait_for(self, pattern: str, timeout: float = PATIENCE) -> re.Match[str]:
+        """Wait until the output contains this pattern."""
+        self.wait_until(lambda _: re.search(pattern, self.text) is not None, timeout)
+        match = re.search(pattern, self.text)
+        assert match
+        return match
 
     def wait_until(self, condition: Callable[[Screen], bool], timeout: float = PATIENCE) -> None:
         """Wait until the condition is true for the screen."""

@@ -14,9 +14,6 @@ from typing import NamedTuple
 import pytest
 
 import talkcli
-from talkcli.cli.commands import COMMANDS
-from talkcli.engine.players import PLAYERS
-from talkcli.engine.voices import SYNTHESIZERS
 
 PACKAGE = Path(talkcli.__file__).parent
 
@@ -157,33 +154,6 @@ def test_no_module_imports_a_layer_above_it_even_for_types() -> None:
     for module in sources().keys() - FACE:
         above = {name for name, _ in inside(module) if name not in FACE and layer(name) > layer(module)}
         assert not above, f"talkcli.{module} imports {above} from a layer above"
-
-
-def test_every_module_is_used() -> None:
-    """A module must be imported by the command, by the engine process, or by another used module."""
-    used: set[str] = set()
-    runs = {
-        function for command in COMMANDS.values() for function in (command.function, command.fleet_function) if function
-    }
-    new = {
-        "__main__",
-        "engine.child.main",
-        "",
-        "aio",
-        "cli.ask",
-        *(f"cli.{function.partition(':')[0]}" for function in runs),
-    }
-    new |= {
-        f"engine.child.players.{player.class_path.partition(':')[0]}"
-        for player in PLAYERS.values()
-        if player.class_path
-    }
-    new |= {f"engine.child.synthesizers.{class_path.partition(':')[0]}" for class_path in SYNTHESIZERS.values()}
-    while new:
-        used |= new
-        new = {name for module in new for name, _ in inside(module)} - used
-    packages = {module_name(path) for path in PACKAGE.rglob("__init__.py")}
-    assert sources().keys() - used <= packages
 
 
 def test_imports_have_no_cycles_even_for_types() -> None:

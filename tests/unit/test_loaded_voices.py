@@ -69,8 +69,6 @@ a voice that the engine loads by itself does not delay others
 
 # memory
 
-above the limit, a voice that is not needed is dropped first
-    memory 100; load a b c; grown a 40; grown b 80; grown c 125; excess c : c  ->  a dropped; b loaded, c loaded
 no voice is dropped below the limit
     memory 100; load a b c; grown a 40; grown b 80; excess b : b  ->  nothing; a loaded, b loaded, c loaded
 the memory of a voice may grow
@@ -110,8 +108,6 @@ all voices of a lost engine are forgotten
     load a b; lost  ->  b; none
 a voice that was loading is waiting again
     want b; next b; lost  ->  b; b waiting
-a voice has failed after the engine died twice
-    want b; next b; lost; want b; next b; lost  ->  b; b failed
 a voice that has failed is not blamed for a third death
     want b; next b; lost; want b; next b; lost; lost; want b; next b  ->  nothing; b failed
 a death is forgotten once the voice is loaded

@@ -14,12 +14,6 @@ RULES = """
 # a text that is complete
 may grow while the goal waits
     a; b more; append b text=c end; completed a; completed b -> a b SUCCEEDED
-lets the next goal start only at its end
-    a more; b; append a text=c end; completed a -> b ACTIVE; a SUCCEEDED
-gives way to a goal that interrupts
-    a more; b preempt; stopped a -> b ACTIVE; a PREEMPTED preempted by b
-expires like any other if it can't start
-    a; b more ttl=1; wait 1 -> a ACTIVE; b RECALLED expired
 # a text that doesn't go on
 ends after its limit
     a more stall=2; starved a; wait 1.9; wait 0.1; stopped a -> a ABORTED text_stalled
@@ -37,8 +31,6 @@ has no limit once it breaks off
     a more stall=2; starved a; left a; wait 9 -> a ACTIVE
 has no limit before it is spoken
     a; b more stall=1; wait 9; completed a -> b ACTIVE; a SUCCEEDED
-makes room for the next goal
-    a more stall=1; b; starved a; wait 1; stopped a -> b ACTIVE; a ABORTED text_stalled
 is cancelled rather than stalled if both happen
     a more stall=1; starved a; cancel a; wait 1; stopped a -> a PREEMPTED canceled by door
 is stopped by force if it doesn't become silent
@@ -68,8 +60,6 @@ takes a waiting goal out of the queue
 doesn't bring back a goal that is cancelled first
     a more; cancel a; left a; stopped a -> a PREEMPTED canceled by door
 # a failure
-of the engine ends the goal
-    a more; failed a -> a ABORTED audio_lost
 of the engine after a stall is not reported instead of it
     a more stall=1; starved a; wait 1; failed a -> a ABORTED text_stalled
 """

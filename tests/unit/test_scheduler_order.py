@@ -20,16 +20,10 @@ a goal that preempts stops the active one and goes first
     a; b; c; d preempt  ->  a PREEMPTING preempted by d; d b c PENDING
 the goal that preempts starts once the active one is silent
     a; b; c; d preempt; stopped a  ->  d ACTIVE; b c PENDING; a PREEMPTED preempted by d
-a goal that preempts starts at once if nothing is spoken
-    a preempt  ->  a ACTIVE
 the newest of several goals that preempt wins
     a; b; c preempt; d preempt  ->  a PREEMPTING preempted by c; d b PENDING; c RECALLED preempted by d
 preempt recalls preempting goals of a lower priority
     a; b -1 preempt; c -1; d preempt  ->  a PREEMPTING preempted by d; d c PENDING; b RECALLED preempted by d
-preempt recalls no goal of a higher priority
-    a 5; b 3 preempt; c 1 preempt  ->  a ACTIVE; b c PENDING
-preempt does not stop a goal of a higher priority
-    a 5; b 4 preempt  ->  a ACTIVE; b PENDING
 preempt stops a goal of a lower priority
     a 5; b 6 preempt  ->  a PREEMPTING preempted by b; b PENDING
 a goal that preempts goes first only among goals of its own priority
@@ -61,8 +55,6 @@ a key does not replace the active goal
     a key=k; b key=k  ->  a ACTIVE; b PENDING
 a key does not replace a goal with another key or none
     a; b key=k; c key=d; d; e key=k  ->  a ACTIVE; e c d PENDING; b RECALLED replaced by e
-a goal of a lower priority does not take the same place
-    a; b key=k; c; d -1 key=k  ->  a ACTIVE; c d PENDING; b RECALLED replaced by d
 a goal of a higher priority does not take the same place
     a; b key=k; c; d 1 key=k  ->  a ACTIVE; d c PENDING; b RECALLED replaced by d
 a goal replaces one of a higher priority, too
@@ -71,8 +63,6 @@ a goal with a key that preempts goes first
     a; b; c key=k; d preempt key=k  ->  a PREEMPTING preempted by d; d b PENDING; c RECALLED replaced by d
 a goal that is both replaced and preempted counts as replaced
     a; b key=k preempt; c key=k preempt  ->  a PREEMPTING preempted by b; c PENDING; b RECALLED replaced by c
-a goal that is both replaced and flushed counts as replaced
-    a; b key=k; c key=k flush  ->  a PREEMPTING preempted by c; c PENDING; b RECALLED replaced by c
 a goal in the place of a preempting one does not count as preempting
     a; b key=k preempt; c key=k; d preempt  ->  a PREEMPTING preempted by b; d c PENDING; b RECALLED replaced by c
 
@@ -110,8 +100,6 @@ a goal without a key is throttled by its text, whatever the first goal's key is
     a key=k; completed a; b text=a throttle=60  ->  a SUCCEEDED; b REJECTED throttled by a
 a goal that expired throttles nothing
     a; b key=k ttl=1; wait 1; c key=k throttle=60  ->  a ACTIVE; c PENDING; b RECALLED expired
-a goal that was aborted throttles nothing
-    a key=k; heard a; failed a; b key=k throttle=60  ->  b ACTIVE; a ABORTED audio_lost
 a goal that was not heard throttles nothing
     a key=k; cancel a; stopped a; b key=k throttle=60  ->  b ACTIVE; a PREEMPTED canceled by door
 a goal that was heard in part throttles
@@ -132,10 +120,6 @@ a goal that has started does not expire
     a ttl=1; wait 100  ->  a ACTIVE
 an expired goal is not started, even without a tick
     a; b ttl=1; c ttl=2; pass 1; completed a  ->  c ACTIVE; a SUCCEEDED; b RECALLED expired
-a goal that expired while it waited for room interrupts nothing
-    room 1; a; b; c ttl=1 preempt waited=1  ->  a ACTIVE; b PENDING; c RECALLED expired
-a goal that expired while it waited for room flushes nothing
-    room 1; a; b; c ttl=1 flush waited=1  ->  a ACTIVE; b PENDING; c RECALLED expired
 a goal that expired while it waited for room replaces nothing
     set ttl=1; a; b key=k; c key=k waited=1  ->  a ACTIVE; b PENDING; c RECALLED expired
 a goal that waited for room for less than its ttl is queued
@@ -161,8 +145,6 @@ goals are accepted and none starts while speech is paused
     pause; a; b  ->  a b PENDING
 the first goal starts at resume
     pause; a; b; resume  ->  a ACTIVE; b PENDING
-a full queue rejects while speech is paused
-    room 1; pause; a; b  ->  a PENDING; b REJECTED queue_full
 the next goal does not start when the paused one ends
     a; b; pause; completed a  ->  b PENDING; a SUCCEEDED
 the next goal starts at resume
@@ -171,16 +153,12 @@ a goal that has preempted the paused one waits
     a; pause; b preempt; stopped a  ->  b PENDING; a PREEMPTED preempted by b
 a goal that has preempted the paused one starts at resume
     a; pause; b preempt; stopped a; resume  ->  b ACTIVE; a PREEMPTED preempted by b
-flush ends the paused goal and waits
-    a; b; pause; c flush; stopped a  ->  c PENDING; a PREEMPTED preempted by c; b RECALLED preempted by c
 the paused goal is the current one for a cancel
     a; b; pause; cancel current; stopped a  ->  b PENDING; a PREEMPTED canceled by door
 a cancel of all goals up to one includes the paused goal
     a; b; c; pause; cancel before=b; stopped a  ->  c PENDING; a PREEMPTED canceled by door; b RECALLED canceled by door
 a goal that is being stopped is not paused
     a; b; cancel a; pause  ->  a PREEMPTING canceled by door; b PENDING
-resume starts no goal while another is being stopped
-    a; b; cancel a; pause; resume  ->  a PREEMPTING canceled by door; b PENDING
 cancel, ttl and the silence limit work while speech is paused
     a; b ttl=1; c; pause; wait 1; cancel c; cancel a; wait 2
         ->  a ABORTED not_silent by door; b RECALLED expired; c RECALLED canceled by door
@@ -197,10 +175,6 @@ the next goal starts when the pause ends
     pause seconds=5; a; b; wait 5  ->  a ACTIVE; b PENDING
 a pause ends even if the tick is late
     pause seconds=5; a; b ttl=1; pass 9; wait 0  ->  a ACTIVE; b RECALLED expired
-the pause of a connection ends with it
-    a; pause connection=x seconds=600; gone x  ->  a ACTIVE
-the pause of a connection has a limit
-    a; pause connection=x seconds=600; wait 600  ->  a ACTIVE
 a connection without a pause ends no pause
     a; pause connection=x seconds=600; gone y  ->  a ACTIVE paused
 speech is paused while one of two listeners is left
@@ -244,8 +218,6 @@ no goal is displaced by a lower priority
     room 2; a; b; c 1; d -1 preempt  ->  a ACTIVE; c b PENDING; d REJECTED queue_full
 a goal with the preempt option displaces its own priority
     room 2; a 2; b; c; d preempt  ->  a ACTIVE; d b PENDING; c RECALLED displaced by d
-a goal with a key and the preempt option displaces its own priority, too
-    room 2; a 2; b; c; d preempt key=k  ->  a ACTIVE; d b PENDING; c RECALLED displaced by d
 a goal with the preempt option displaces its own priority while speech is paused
     room 2; a 2; b; c; pause; d preempt  ->  a ACTIVE paused; d b PENDING; c RECALLED displaced by d
 a goal with the preempt option displaces the newest of the lowest priority
@@ -358,8 +330,6 @@ if the engine reports that it can't be silent, the goal is aborted
     a; b; cancel a; deaf a  ->  b ACTIVE; a ABORTED not_silent by door
 a goal that is not stopped has no limit
     a; wait 1000000  ->  a ACTIVE
-goals wait while there is no engine
-    lost; a ttl=1; b; wait 0.5  ->  a b PENDING
 goals expire while there is no engine
     lost; a ttl=1; b; wait 1  ->  b PENDING; a RECALLED expired
 the next goal starts when there is an engine

@@ -29,8 +29,6 @@ a goal with a voice does not wait for the server's voice
     set voice=piper/joe; a voice=en; b  ->  a ACTIVE; b PENDING
 a goal without a voice starts if the server's voice changes
     set voice=piper/joe; a; set voice=en  ->  a ACTIVE
-a goal waits until loading has taken ten seconds
-    set voice=piper/joe; wait 4; a voice=piper/joe; wait 5.9  ->  a PENDING
 a goal starts once loading has taken ten seconds
     set voice=piper/joe; wait 4; a voice=piper/joe; wait 6  ->  a ACTIVE
 a sound does not wait for the server's voice
@@ -41,16 +39,12 @@ a goal that flushes does not wait
     a voice=piper/joe; b voice=piper/joe flush  ->  b ACTIVE; a RECALLED preempted by b
 a goal of a higher priority does not wait
     a voice=piper/joe; b voice=piper/joe 1  ->  b ACTIVE; a PENDING
-a goal of a lower priority waits
-    a voice=piper/joe -1  ->  a PENDING
 a goal that expires in half a second starts at once
     a voice=piper/joe ttl=0.5  ->  a ACTIVE
 a goal with voice_only waits until the voice is loaded
     a voice=piper/joe voice_only; wait 60  ->  a PENDING
 a goal with voice_only waits even if it preempts
     a voice=piper/joe voice_only preempt; wait 60  ->  a PENDING
-a goal with voice_only waits even if its priority is high
-    a voice=piper/joe voice_only 5; wait 60; loaded joe  ->  a ACTIVE
 a goal with voice_only expires like any other goal
     a voice=piper/joe voice_only ttl=3; b; wait 3  ->  b ACTIVE; a RECALLED expired
 a goal starts if the goal before it is cancelled
@@ -65,8 +59,6 @@ a goal that has waited ten seconds for an engine does not wait for its voice
     a voice=piper/joe; lost; wait 20; ready  ->  a ACTIVE
 goals wait for no voice if there is no engine to load it
     a voice=piper/joe; lost; unavailable  ->  a ACTIVE
-a missing engine aborts a goal that waited for its voice
-    a voice=piper/joe; lost; missing  ->  a ABORTED engine_failed
 """
 
 #: The time at which the next goal stops waiting, in monotonic seconds. A script starts at 100.
