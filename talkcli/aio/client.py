@@ -73,7 +73,7 @@ class GoalHandle(GoalCalls):
         return await self._cancel()
 
     async def _iterate_events(self, timeout: float | None, *, feedback: bool) -> AsyncIterator[Event]:
-        """Yield the goal's events up to the Result. Raise TimeoutError if `timeout` expires first."""
+        """Follow the goal, optionally with words, and yield its events. Raise TimeoutError after `timeout`."""
         end, event = end_time(timeout), None
         read = event_reader(self._connection, self._take, end)
         await self._follow(feedback=feedback)
@@ -96,7 +96,7 @@ class SpeechStream(StreamCalls):
     _handle_type = GoalHandle
 
     async def write(self, text: str) -> bool:
-        """Add text at the end, and send it. Return whether the goal accepts more.
+        """Add text at the end, send it, and wait for the answer. Return whether the goal accepts more.
 
         If more than 10,000 characters have not been heard, the call waits until more of them have been heard.
         """

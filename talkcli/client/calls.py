@@ -183,7 +183,7 @@ class ClientCalls(ConnectedClient):
     async def _say(
         self, handle_type: type[_Handle], text: str, *, follow: bool = True, block: bool = True, **options: Any
     ) -> _Handle:
-        """Send a text to be spoken. Return the handle of its goal."""
+        """Send a text to be spoken. With `block`, wait for the server's answer. Return the goal's handle."""
         request = Say(text, wait=follow or options.get("feedback") is True, **options)
         if not (block or request.id):
             request = replace(request, id=self._connection.new_goal_id())

@@ -75,10 +75,10 @@ class ConnectionAttempt:
 def reach(
     named_path: str | None, failures: tuple[tuple[str, Exception], ...] = (), only_path: str | None = None
 ) -> ConnectionAttempt:
-    """Connect to `named_path` or, if it is None, to the first default path that works. Return the attempt's state.
+    """Connect to `named_path`, or to the first usable default path not in `failures`. Return the attempt.
 
-    `failures` are the paths that have already failed, with their errors. They are skipped. If `only_path` is given, it
-    is the only path to try. Nothing is sent.
+    The default paths are tried if `named_path` is None. `failures` are the paths that have already failed, with their
+    errors. If `only_path` is given, it is the only path to try. Nothing is sent.
     """
     for path in [only_path] if only_path else paths.client_sockets(named_path)[len(failures) :]:
         connected = _socket.socket(_socket.AF_UNIX, _socket.SOCK_STREAM)

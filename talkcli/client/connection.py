@@ -469,7 +469,7 @@ class SocketConnection(Connection):
         return {self._socket.fileno(): select.POLLIN | (select.POLLOUT if self.outgoing() else 0)}, NEVER
 
     def process(self, ready: Collection[int]) -> None:
-        """Read from the socket, and process the data."""
+        """Read once from the socket, and process the data. Break off the connection if it has ended."""
         polled, early = self._polled, self._received_early
         if early:
             with self.changed:

@@ -258,7 +258,7 @@ class TrackedGoal:
     def _hear(
         self, event: StateChanged | WordHeard | events.TextMissing | events.GoalInterrupted | PausedChanged | Goal
     ) -> None:
-        """Update the goal from an event, and buffer the event."""
+        """Update the goal from an event, and buffer the event. Do nothing if the goal has ended."""
         if self.goal.state.terminal:
             return
         if isinstance(event, Goal):

@@ -53,7 +53,7 @@ class StreamCalls:
         return self._refused or (self.goal is not None and self.goal.state.terminal)
 
     async def _write(self, text: str) -> bool:
-        """Add text at the end, and send it. Return whether the goal accepts more."""
+        """Add text at the end, send it, and wait for the answer. Return whether the goal accepts more."""
         if not self._stopped:
             self._text.write(text)
         return await self._send()
@@ -146,7 +146,7 @@ class SpeechStream(StreamCalls):
     _handle_type = GoalHandle
 
     def write(self, text: str) -> bool:
-        """Add text at the end, and send it. Return whether the goal accepts more.
+        """Add text at the end, send it, and wait for the answer. Return whether the goal accepts more.
 
         Text is sent at once, except blanks at the very beginning. If more than 10,000 characters have not been heard,
         the call waits until more of them have been heard.

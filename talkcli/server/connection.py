@@ -393,7 +393,7 @@ class ClientConnection(asyncio.Protocol):
             self._loop.call_soon(self._do_scheduled_work)
 
     def _do_scheduled_work(self) -> None:
-        """Do the scheduled work, and allow more work to be scheduled."""
+        """Call `_work`, and allow it to be scheduled again."""
         self._work_is_scheduled = False
         self._work()
 

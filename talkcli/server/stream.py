@@ -179,10 +179,7 @@ class ClientStream:
             self._streams.shed_load()
 
     def write(self, data: bytes) -> None:
-        """Queue data to be sent soon.
-
-        If too much output is unread in total, disconnect the slowest clients.
-        """
+        """Queue data for sending. If too much output is unread in total, disconnect the slowest clients."""
         if self.closing:
             return
         self._unread += data

@@ -776,7 +776,7 @@ class Playback:
         self._wait([*interests, *other_interests], until)
 
     def _wait(self, interests: Sequence[Interest] = (), until: float = NEVER) -> None:
-        """Wait, and execute commands meanwhile. Raise Stopped if the sentence was stopped."""
+        """Wait for descriptors or a time, and execute commands meanwhile. Raise Stopped or EndedEarly if due."""
         self._runner.wait(interests, until)
         self._raise_if_ended()
 

@@ -48,7 +48,7 @@ class WordFinder:
         self._count = count
 
     def find(self, location: int, length: int) -> tuple[int, int, int] | None:
-        """Find the word at a location. Return its start, end and number if it is new.
+        """Find the word at a location. Return its start, end and number, or None if the word isn't new.
 
         The first word has number 1.
         """

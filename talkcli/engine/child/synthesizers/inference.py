@@ -88,11 +88,7 @@ class ModelCache:
         self._directory = directory
 
     def find(self, key: str) -> tuple[str, str]:
-        """Return the paths of a cached encoder and decoder, and mark both as used.
-
-        Raises:
-            OSError: One of them isn't cached.
-        """
+        """Mark a cached encoder and decoder as used, and return their paths. Raise OSError if one is missing."""
         paths = self._cached_path(key, _ENCODER_SUFFIX), self._cached_path(key, _DECODER_SUFFIX)
         for each in paths:
             os.utime(each)
