@@ -35,7 +35,7 @@ _CLEAR_LINE = "\r\x1b[2K"
 
 
 def make_feedback(options: CommonOptions) -> Feedback:
-    """Create the display for --feedback that suits the options and the terminal."""
+    """Choose and create the display for --feedback."""
     if options.json:
         return _JsonFeedback()
     # With other encodings, the displayed width of characters is unknown.

@@ -111,7 +111,7 @@ def _read_option(flags: Flags, word: str, rest: list[str], given: dict[str, Any]
 def _build_command(
     command: Command, given: dict[str, Any], words: list[str], environment: Mapping[str, str]
 ) -> PlainCommand | None:
-    """Return a checked command with default values added, or None if click has to parse it."""
+    """Check a command, and add default values. Return None if click has to parse the command."""
     common = {name: given.pop(name) for name in _COMMON_NAMES & given.keys()}
     typed = frozenset(given)
     for option in command.options:

@@ -629,7 +629,7 @@ class Scheduler:
     def completed(
         self, goal_id: str, duration: float | None, now: Now, gaps: int = 0, gap_seconds: float = 0
     ) -> list[Effect]:
-        """End the active goal as SUCCEEDED, or as ABORTED if its text broke off. Return the effects.
+        """End the active goal as SUCCEEDED, or as ABORTED if its text is incomplete. Return the effects.
 
         Its audio was played to the end.
 

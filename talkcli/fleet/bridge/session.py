@@ -184,7 +184,7 @@ class RemoteSessions:
         return [session.end_goal(request, say, *ending) for request, say, session in selected]
 
     def handle_pending_change(self) -> None:
-        """Call `on_change`, and schedule an attempt to send the goals that wait in the bridge.
+        """Call `on_change`, and schedule `_send_or_cancel_waiting` if any goal waits in the bridge.
 
         Call this whenever the number of pending goals may have changed. Events that were received together are all
         processed before goals are released.
@@ -214,7 +214,7 @@ class RemoteSessions:
     # -- from the publisher
 
     def handle_goal_change(self, event: StateChanged, boot: str) -> None:
-        """Record whether a goal is now pending. Schedule an attempt to send goals that wait in the bridge."""
+        """Record whether a remote goal is now pending, and schedule `_send_or_cancel_waiting`."""
         goal = event.goal
         if event.state is not State.PENDING:
             counted = self.goals.remove(event.id)
@@ -234,7 +234,7 @@ class RemoteSessions:
             self.ids.add(goal.id, boot, user)
 
     def reset_pending(self, pending: tuple[Goal, ...], boot: str) -> None:
-        """Replace the recorded pending goals. Schedule an attempt to send goals that wait in the bridge."""
+        """Replace the recorded pending goals, and schedule `_send_or_cancel_waiting`."""
         self.goals.replace_pending((each.id, each.key) for each in pending if self.ids.is_counted(each.id, boot))
         self.handle_pending_change()
 

@@ -268,7 +268,7 @@ class FleetRequestCalls:
             each.connection.on_disconnected(why)
 
     def on_message(self, message: Message) -> None:
-        """Process a robot's presence, or lines from its server."""
+        """Process a presence message, or lines from a robot's server."""
         _, kind, *_, name, last = message.topic.split("/")
         if kind != topics.ROBOT_LEVEL:
             self._on_reply(last, message)
