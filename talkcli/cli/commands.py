@@ -233,7 +233,10 @@ def _pause_fault(given: Mapping[str, Any], _: frozenset[str]) -> str | None:
 
 
 def _bridge_fault(values: Mapping[str, Any], _: frozenset[str]) -> str | None:
-    """Return an error message if `bridge` has neither --name nor an option that prints access rules."""
+    """Return an error message if `bridge` lacks --name, or has several options that print something."""
+    printed = [f"--{each.replace('_', '-')}" for each in ("print_unit", "print_acl", "print_addon_acl") if values[each]]
+    if len(printed) > 1:
+        return f"{' and '.join(printed)} can't be combined; use only one of them"
     if values["name"] is None and not (values["print_acl"] or values["print_addon_acl"]):
         return "--name is missing; choose the robot's name on the broker, as in: talk bridge --name anna"
     return None

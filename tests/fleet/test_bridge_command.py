@@ -42,6 +42,11 @@ def run_bridge(home: str, *arguments: str, **extra: str) -> tuple[int, str, str]
         ("--name anna --allow say,cancle", {}, "--allow: unknown request 'cancle'; did you mean 'cancel'?"),
         ("--name anna --allow xyz", {}, "--allow: unknown request 'xyz'; choose from say, wait, cancel"),
         ("--name anna --print-unit launchd", {}, "--print-unit: 'launchd' is not one of"),
+        (
+            "--name anna --print-addon-acl --print-acl --homeassistant",
+            {},
+            "--print-acl and --print-addon-acl can't be combined; use only one of them",
+        ),
         ("--name anna", {}, "TALK_BROKER is not set; name your broker"),
         ("anna", {}, "'talk bridge' takes no arguments (got 'anna')"),
         ("--name anna", {"TALK_BROKER": "http://broker"}, "TALK_BROKER is not the URL of a broker"),
