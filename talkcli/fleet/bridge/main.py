@@ -161,6 +161,8 @@ class Bridge:
         self._echo_at = 0.0
         #: when the presence was last published, by the event loop's clock
         self._presence_at = 0.0
+        #: timer that describes the robot for Home Assistant again
+        self._device_timer: asyncio.TimerHandle | None = None
         self._ending = asyncio.Event()
         self._error: BaseException | None = None
 
@@ -403,7 +405,8 @@ class Bridge:
             self._handle_presence(message.payload)
             return
         if message.topic == topics.HOMEASSISTANT_STATUS and message.payload == b"online":
-            self._loop.call_later(random.uniform(0, _DEVICE_DELAY_S), self._publish_device)
+            delay = random.uniform(0, _DEVICE_DELAY_S)
+            self._device_timer = self._device_timer or self._loop.call_later(delay, self._publish_device)
         topic = topics.parse_request_topic(message.topic)
         if topic is None or not self._online:
             return
@@ -477,6 +480,7 @@ class Bridge:
 
     def _publish_device(self) -> None:
         """Publish the robot's description for Home Assistant as a retained message, if enabled."""
+        self._device_timer = None
         if self._settings.homeassistant and self._online:
             self._publish(homeassistant_device(self._settings.name, self._settings.allow, __version__))
 
