@@ -187,10 +187,8 @@ _END_TEMPLATE = (
     f"message=value_json.goal.message, by=value_json.goal.by) if value_json.state in {_END_STATES} else {{}}) "
     "| tojson }}"
 )
-#: Seconds within which a message to the notifier must be spoken. Home Assistant sends messages that don't expire.
-_SAY_TTL_S = 30
-# Home Assistant inserts the message of the action `notify.send_message` as `value`.
-_SAY_TEMPLATE = f"{{{{ dict(request='say', text=value, ttl={_SAY_TTL_S}) | tojson }}}}"
+# Home Assistant inserts the message of the action `notify.send_message` as `value`. It can't set a TTL for the message.
+_SAY_TEMPLATE = "{{ dict(request='say', text=value, ttl=30) | tojson }}"
 _INTERRUPT_TEMPLATE = "{{ dict(request='say', text=value, preempt=True, priority=10, ttl=10) | tojson }}"
 #: The requests that each component sends. The other components send none.
 _NEEDED_REQUESTS = {
@@ -214,7 +212,7 @@ def homeassistant_device(name: str, allow: Collection[str], version: str) -> Mes
     components = {
         "say": _component("notify", None, "bullhorn", command_template=_SAY_TEMPLATE),
         "interrupt": _component("notify", "Interrupt", "bullhorn-variant", command_template=_INTERRUPT_TEMPLATE),
-        "cancel": _component("button", "Cancel", "stop", payload_press=_request_payload("cancel")),
+        "cancel": _component("button", "Cancel", "stop", payload_press='{"request": "cancel"}'),
         "paused": _component(
             "switch",
             "Paused",
@@ -223,8 +221,8 @@ def homeassistant_device(name: str, allow: Collection[str], version: str) -> Mes
             value_template=_PAUSED_TEMPLATE,
             state_on="ON",
             state_off="OFF",
-            payload_on=_request_payload("pause"),
-            payload_off=_request_payload("resume"),
+            payload_on='{"request": "pause"}',
+            payload_off='{"request": "resume"}',
         ),
         "state": _component(
             "sensor",
@@ -293,8 +291,3 @@ def homeassistant_device(name: str, allow: Collection[str], version: str) -> Mes
 def _component(platform: str, name: str | None, icon: str, **keys: object) -> JsonObject:
     """Return a component of a Home Assistant device, with these keys."""
     return {"platform": platform, "name": name, "icon": f"mdi:{icon}", "qos": 1, **keys}
-
-
-def _request_payload(kind: str) -> str:
-    """Return the payload of a request that has no fields."""
-    return encode({"request": kind}).decode().removesuffix("\n")

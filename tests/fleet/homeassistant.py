@@ -1,7 +1,6 @@
 """Home Assistant's rules for MQTT device discovery, and a client that follows them.
 
-The rules are those of www.home-assistant.io/integrations/mqtt: device discovery payload, notify, button, sensor, binary
-sensor. Home Assistant itself is not installed here.
+The rules are those of www.home-assistant.io/integrations/mqtt. Home Assistant itself is not installed here.
 """
 
 from __future__ import annotations

@@ -70,17 +70,6 @@ def test_a_flood_of_announcements_reports_each_lost_one(announced: Robot) -> Non
     announced.bridge.await_log("rejected a goal of homeassistant: 15 goals of remote clients are already waiting")
 
 
-def test_an_interrupting_message_replaces_the_current_one(announced: Robot) -> None:
-    with HomeAssistant(announced.broker) as home:
-        device = home.device()
-        home.command(device, "say", LONG)
-        home.await_states(device, state="speaking")
-        home.command(device, "interrupt", "fire")
-        home.await_states(device, last="SUCCEEDED")
-        ended = [(event["text"], event["event_type"]) for event in home.end_events(device)]
-    assert ended == [(LONG, "PREEMPTED"), ("fire", "SUCCEEDED")]
-
-
 def test_the_announcement_is_repeated_when_home_assistant_starts(announced: Robot) -> None:
     with HomeAssistant(announced.broker) as home:
         kept = home.await_message(lambda message: message.topic == ANNA)

@@ -161,7 +161,7 @@ class Bridge:
         self._echo_at = 0.0
         #: when the presence was last published, by the event loop's clock
         self._presence_at = 0.0
-        #: timer that describes the robot for Home Assistant again
+        #: timer for the next description for Home Assistant; None if none is scheduled
         self._device_timer: asyncio.TimerHandle | None = None
         self._ending = asyncio.Event()
         self._error: BaseException | None = None
