@@ -108,6 +108,8 @@ def test_a_device_is_unavailable_without_its_server_or_its_robot(make_robot: Mak
         home.await_states(device, state="idle")
         robot.talk.kill()
         home.await_states(device, state="unavailable")
+        home.command(device, "say", "hello")
+        robot.bridge.await_log("refused a request of homeassistant: ")
         robot.talk.start_server()
         home.await_states(device, state="idle")
         robot.bridge.kill()
