@@ -54,21 +54,6 @@ def test_status_shows_the_settings_and_the_details_of_each_goal(busy: Talk) -> N
     assert re.search(r'"the door is open" +from "patrol" \(\S.*, pid \d+\)$', long[5])
 
 
-def test_status_fits_the_terminal(busy: Talk) -> None:
-    with Terminal([*TALK, "status"], {"TERM": "xterm", **busy.env}, 120) as shown:
-        assert shown.finish() == 0
-        lines = shown.lines
-    assert max(map(width, lines)) <= 120
-    text = " ".join(" ".join(lines).split())
-    for part in (f"pid {busy.pid} on {busy.socket}", "256 clients", "driver scripted", "voice default", "audio_l"):
-        assert part in text
-    assert 'from "patrol"' in text
-    assert "priority" in text
-    goals = [line for line in lines if "PENDING" in line]
-    assert goals[0].index('"') == goals[1].index('"')
-    assert b"\x1b[1;32mACTIVE" in shown.raw
-
-
 def test_status_of_one_goal_shows_all_its_details(busy: Talk) -> None:
     pending = json.loads(busy.run("--json", "status").out)["pending"][0]
     lines = dict(line.split(None, 1) for line in busy.run("status", pending["id"]).out.splitlines())

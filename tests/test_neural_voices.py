@@ -14,8 +14,6 @@ import pytest
 
 from talkcli import install
 from talkcli.client.client import Client
-from talkcli.engine.protocol import Voice
-from talkcli.engine.voices import find_voice
 from talkcli.install import NEURAL_PACKAGES
 from tests.conformance.bareserve import LIMIT, SERVE, TALK, Ended, environment, serving
 from tests.conformance.bareserve import run as run_program
@@ -23,7 +21,6 @@ from tests.engine.test_neural import WITHOUT
 from tests.support import tiny_voice
 from tests.support.processes import children
 from tests.support.surroundings import needs, needs_packages
-from tests.test_completion import offered
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -36,7 +33,6 @@ if TYPE_CHECKING:
 TINY, BROKEN = "piper/tiny", "piper/broken"
 #: The espeak voice that replaces these voices, whose language is en-us.
 INSTEAD = "gmw/en-US"
-LONG = "this goes on and on " * 20
 #: Runs first in each Python process: models load only after the file HOLD is removed, and may take more memory. The
 #: server may wait less for its engine.
 SITE = """
@@ -133,17 +129,9 @@ class Robot:
             assert time.monotonic() < limit, f"the condition never became true: {self.server.log}"
             time.sleep(0.02)
 
-    def until_crashed(self, times: int) -> None:
-        """Wait until the server has logged this number of engine crashes."""
-        self.until(lambda: self.server.log.count("the engine crashed") == times)
-
-    def until_loaded(self, voice: str = TINY) -> None:
-        """Wait until a voice is loaded."""
-        self.until(lambda: self.neural(voice)["state"] == "loaded")
-
-    def kill_engine(self) -> None:
+    def signal_engine(self, number: signal.Signals) -> None:
         for engine in children(self.server.process.pid):
-            os.kill(engine, signal.SIGKILL)
+            os.kill(engine, number)
 
 
 @contextlib.contextmanager
@@ -226,8 +214,8 @@ def test_a_voice_that_crashes_the_engine_twice_is_not_used(env: dict[str, str], 
     with _robot(env, "--voice", TINY) as robot:
         for crashes in (1, 2):
             robot.until(lambda: robot.neural()["state"] == "loading")
-            robot.kill_engine()
-            robot.until_crashed(crashes)
+            robot.signal_engine(signal.SIGKILL)
+            robot.until(lambda: robot.server.log.count("the engine crashed") == crashes)  # noqa: B023
         robot.until(lambda: robot.neural()["state"] == "failed")
         assert robot.neural()["why"] == why
         ended = robot.say("a", None, voice_only=True).wait(LIMIT)
@@ -242,9 +230,9 @@ def test_a_voice_that_crashes_the_engine_twice_is_not_used(env: dict[str, str], 
 
 def test_espeak_speaks_if_the_files_of_a_voice_are_missing(env: dict[str, str], tmp_path: Path) -> None:
     with _robot(env, "--voice", TINY) as robot:
-        robot.until_loaded()
+        robot.until(lambda: robot.neural()["state"] == "loaded")
         (tmp_path / "voices" / "tiny.onnx").unlink()
-        robot.kill_engine()
+        robot.signal_engine(signal.SIGKILL)
         robot.until(lambda: robot.neural()["state"] == "failed")
         goal = robot.say("a", None)
         state, voice = robot.heard(goal)
@@ -257,8 +245,7 @@ def test_an_engine_that_hangs_while_loading_is_replaced(env: dict[str, str], hol
     with _robot(env) as robot:
         goal = robot.say(voice_only=True)
         robot.until(lambda: robot.neural()["state"] == "loading")
-        for engine in children(robot.server.process.pid):
-            os.kill(engine, signal.SIGSTOP)
+        robot.signal_engine(signal.SIGSTOP)
         robot.until(lambda: "did not respond for 0.5 s while loading piper/tiny" in robot.server.log)
         hold.unlink()
         assert robot.heard(goal) == ("SUCCEEDED", TINY)
@@ -339,21 +326,6 @@ def test_text_from_a_voices_files_is_always_escaped(env: dict[str, str], tmp_pat
     for text in (server.log, *(done.out + done.err for done in shown)):
         assert not {"\x1b", "\x07", "\u202e"} & {*text}, text
         assert max(map(len, text.splitlines()), default=0) < 1000
-
-
-def test_every_voice_offered_by_completion_exists(env: dict[str, str]) -> None:
-    with serving(env):
-        listed = [json.loads(line) for line in run([*TALK, "--json", "voices"], env).out.splitlines()]
-        offers = {
-            typed: [value for value, _ in offered(f"talk say --voice {typed}", env)] for typed in ("", "pi", "ti", "E")
-        }
-    voices = tuple(Voice(**fields) for fields in listed)
-    for typed, values in offers.items():
-        for value in values:
-            assert find_voice(value, voices) is not None, (typed, value)
-    assert {"piper/tiny", "piper/broken", "en-us"} <= {*offers[""]}
-    assert {"piper/broken", "piper/tiny"} <= {*offers["pi"]}
-    assert offers["ti"] == []
 
 
 def test_a_neural_voice_is_refused_with_another_driver(env: dict[str, str]) -> None:

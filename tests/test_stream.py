@@ -7,17 +7,19 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import socket
 from typing import TYPE_CHECKING
 
 import pytest
 
 from talkcli.server import stream
-from talkcli.server.stream import ClientStream, ClientStreams
+from talkcli.server.stream import Acceptor, ClientStream, ClientStreams
 from tests.support.loop import in_loop
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
+    from pathlib import Path
 
 
 class CountingSocket(socket.socket):
@@ -279,3 +281,35 @@ async def test_the_client_with_the_largest_backlog_is_dropped_at_the_limit(monke
         for pair in (pairs[0], pairs[2]):
             pair.stream.abort()
         assert (streams.unread_bytes, streams.open) == (0, set())
+
+
+class FullSocket(socket.socket):
+    """A listening socket that accepts no connection at first, because no file descriptor is free."""
+
+    failures = 1
+
+    def accept(self) -> tuple[socket.socket, str]:
+        if self.failures:
+            self.failures -= 1
+            raise OSError(errno.EMFILE, "Too many open files")
+        return super().accept()
+
+
+@in_loop
+async def test_connections_are_accepted_when_a_descriptor_is_free_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(stream, "ACCEPT_RETRY_S", 0.01)
+    accepted: list[socket.socket] = []
+    with FullSocket(socket.AF_UNIX) as listening, socket.socket(socket.AF_UNIX) as client:
+        listening.bind(str(tmp_path / "s"))
+        listening.listen()
+        client.connect(str(tmp_path / "s"))
+        acceptor = Acceptor(accepted.append, 10_000)
+        acceptor.open(listening)
+        await turn()
+        assert (listening.failures, accepted) == (0, [])
+        for _ in range(1_000):
+            await asyncio.sleep(0 if accepted else 0.01)
+        acceptor.close()
+        accepted[0].close()
