@@ -236,11 +236,11 @@ class InputSpeaker:
         """
         raise NotImplementedError
 
-    def _wait_unless_input(self, wait: Callable[[], object], *, wants_input: bool) -> bytes | None:
+    def _wait_unless_input(self, function: Callable[[], object], *, wants_input: bool) -> bytes | None:
         """Call a function that blocks, and interrupt it if input arrives. Return the input, or None.
 
         Args:
-            wait: the function.
+            function: the function, which waits with `_interrupts.watched`.
             wants_input: whether input interrupts the function.
 
         Returns:
@@ -253,7 +253,7 @@ class InputSpeaker:
         if wants_input:
             watched[0] = select.POLLIN
         try:
-            wait()
+            function()
         except Interrupted:
             if watched.pop(0, None) is None:
                 raise

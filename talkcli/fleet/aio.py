@@ -82,6 +82,6 @@ class Fleet(FleetCalls[FleetRequest]):
         client._open = partial(LoopRobotConnection.open, name, self._broker, name=self._name)
         return client
 
-    def _send_request(self, to: str, request: Request) -> FleetRequest:
+    def _create_request(self, to: str, request: Request) -> FleetRequest:
         """Create a request to the selected robots, without sending it."""
         return FleetRequest(self._broker, Selection(to), request, name=self._name, wait=wait_ready)

@@ -66,7 +66,7 @@ class FleetCalls(Generic[FleetRequestT]):
             ttl: the time in seconds within which each robot must start speaking, or 0 for no limit. The default is 10.
             options: other options of `Client.say`, except `follow`.
         """
-        return self._send_request(to, Say(text, wait=wait, ttl=ttl, **options))
+        return self._create_request(to, Say(text, wait=wait, ttl=ttl, **options))
 
     def cancel(
         self,
@@ -82,29 +82,29 @@ class FleetCalls(Generic[FleetRequestT]):
         The request yields the outcomes. By default, all goals are cancelled. The other arguments are those of
         `Client.cancel`. The outcome of a robot arrives when the robot is silent.
         """
-        return self._send_request(to, Cancel(None if ids is None else tuple(ids), current, before, key))
+        return self._create_request(to, Cancel(None if ids is None else tuple(ids), current, before, key))
 
     def wait(self, to: str, ids: Iterable[str] | None = None) -> FleetRequestT:
         """Return a request that waits for some or all goals on each robot."""
-        return self._send_request(to, Wait(None if ids is None else tuple(ids)))
+        return self._create_request(to, Wait(None if ids is None else tuple(ids)))
 
     def status(self, to: str) -> FleetRequestT:
         """Request the status of each robot's server. Return the request.
 
         The request yields the outcomes. Each outcome contains the status as `said["status"]`.
         """
-        return self._send_request(to, Status())
+        return self._create_request(to, Status())
 
     def pause(self, to: str, seconds: float | None = None) -> FleetRequestT:
         """Pause speech on each robot, for `seconds` or until `resume` is called. Return the request.
 
         `seconds` is 0.1 to 86,400. If it is None, only `resume` ends the pause.
         """
-        return self._send_request(to, Pause(seconds))
+        return self._create_request(to, Pause(seconds))
 
     def resume(self, to: str) -> FleetRequestT:
         """Resume paused speech on each robot. Return the request."""
-        return self._send_request(to, Resume())
+        return self._create_request(to, Resume())
 
     def set(self, to: str, **settings: Any) -> FleetRequestT:
         """Change the settings of each robot's server. Return the request.
@@ -112,10 +112,10 @@ class FleetCalls(Generic[FleetRequestT]):
         The request yields the outcomes. If a robot's bridge doesn't allow this, its outcome is REFUSED. The arguments
         are those of `Client.set`.
         """
-        return self._send_request(to, Set(**settings))
+        return self._create_request(to, Set(**settings))
 
-    def _send_request(self, to: str, request: Request) -> FleetRequestT:
-        """Create a request to the selected robots."""
+    def _create_request(self, to: str, request: Request) -> FleetRequestT:
+        """Create a request to the selected robots. The blocking fleet also sends it."""
         raise NotImplementedError
 
 
@@ -161,8 +161,8 @@ class Fleet(FleetCalls["FleetRequest"]):
 
         return Client.over(run_blocking(RobotConnection.open(name, self._broker, name=self._name)))
 
-    def _send_request(self, to: str, request: Request) -> FleetRequest:
-        """Send a request to the selected robots. Return the FleetRequest."""
+    def _create_request(self, to: str, request: Request) -> FleetRequest:
+        """Create a request to the selected robots, and send it. Return the FleetRequest."""
         from talkcli.fleet.desk.several import FleetRequest
 
         return FleetRequest(self._broker, Selection(to), request, name=self._name)

@@ -659,7 +659,8 @@ class Scheduler:
     def failed(self, goal_id: str, reason: Reason, message: str, duration: float | None, now: Now) -> list[Effect]:
         """End the active goal as ABORTED, or as PREEMPTED if it was being stopped. Return the effects.
 
-        A failure silences a goal that is being stopped. With the reason `not_silent`, the goal is always ABORTED.
+        A failure silences a goal that is being stopped. With the reason `not_silent`, the goal is always ABORTED. If
+        all of a text was heard before an interruption, the goal succeeds.
         """
         record = self._require_active(goal_id)
         record.duration = duration
