@@ -7,11 +7,13 @@ import os
 import select
 import time
 from typing import TYPE_CHECKING, Any
+from unittest.mock import Mock
 
 import pytest
 
 from talkcli import install
 from talkcli.engine import protocol
+from talkcli.engine.child.driver import Driver
 from talkcli.frozen import replace
 from tests.engine.process import Engine, SharedEngine
 from tests.support.timing import assert_within, limits
@@ -345,3 +347,14 @@ def test_words_are_reported_and_a_stop_works_during_a_long_computation() -> None
         assert elapsed > 0.1
         assert_within(elapsed, 0.3, "the word before the gap")
         assert_within(engine.stop(), 0.05, "the stop")
+
+
+def test_the_properties_are_those_of_pyttsx3_and_pitch() -> None:
+    driver = Driver(Mock(), Mock(), Mock())
+    names = ("rate", "volume", "pitch")
+    assert [driver.getProperty(name) for name in names] == [200, 1.0, 50]
+    for name, value in zip(names, ("300", "0.5", "60"), strict=True):
+        driver.setProperty(name, value)
+    assert [driver.getProperty(name) for name in names] == [300, 0.5, 60]
+    with pytest.raises(KeyError):
+        driver.setProperty("speed", 1)

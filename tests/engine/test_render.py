@@ -496,7 +496,11 @@ def test_a_stream_of_events_does_not_extend_the_deadline() -> None:
 
 
 @pytest.mark.usefixtures("scripted_process")
-def test_doctor_reports_hangs_during_and_after_the_start_alike(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_doctor_reports_hangs_crashes_and_long_sentences(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    died = SentenceResult(State.ABORTED, "engine_crashed", "it was killed by SIGSEGV")
+    assert sentence.speak_by_engine("silent-start crash", EngineOptions(), 1.0, 20.0) == died
+    late = SentenceResult(State.ABORTED, "engine_hung", "the sentence did not end within 0.5 s")
+    assert sentence.speak_by_engine("never-ends", EngineOptions(), 1.0, 0.5) == late
     monkeypatch.setattr(process, "HANG_LIMIT_S", 0.4)
     hung = SentenceResult(State.ABORTED, "engine_hung", "the engine process did not respond for 0.4 s")
     assert sentence.speak_by_engine("hang", EngineOptions(), 1.0, 20.0) == hung
@@ -506,11 +510,3 @@ def test_doctor_reports_hangs_during_and_after_the_start_alike(monkeypatch: pyte
     monkeypatch.setattr(process, "START_LIMIT_S", 0.3)
     message = "the engine process did not respond for 0.3 s"
     assert voice.probe_engine(EngineOptions()) == EngineReport(reason="engine_hung", message=message)
-
-
-@pytest.mark.usefixtures("scripted_process")
-def test_doctor_reports_a_crash_and_a_sentence_that_takes_too_long() -> None:
-    died = SentenceResult(State.ABORTED, "engine_crashed", "it was killed by SIGSEGV")
-    assert sentence.speak_by_engine("silent-start crash", EngineOptions(), 1.0, 20.0) == died
-    late = SentenceResult(State.ABORTED, "engine_hung", "the sentence did not end within 0.5 s")
-    assert sentence.speak_by_engine("never-ends", EngineOptions(), 1.0, 0.5) == late
