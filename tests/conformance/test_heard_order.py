@@ -20,7 +20,6 @@ from tests.conformance.hearing import (
     LOW,
     PRECISION,
     QUICK,
-    SHORTER,
     assert_aborted,
     assert_same,
     await_word,
@@ -174,18 +173,18 @@ def test_a_goal_uses_the_settings_at_its_start_except_its_own(talk: Talk) -> Non
 
 @with_both
 def test_row_03_the_cancel_command_returns_after_the_sound_has_stopped(talk: Talk, voice: Voice) -> None:
-    goal = start_goal(talk, SHORTER)
+    goal = start_goal(talk, LONG)
     canceled = talk.run("cancel", goal)
     returned = time.monotonic()
     assert (canceled.code, canceled.id, canceled.err) == (0, goal, "")
     samples = heard(talk)
     _assert_last_sound_before(talk, returned)
-    assert_only_beginning(samples, voice.render([SHORTER])[0])
+    assert_only_beginning(samples, voice.render([LONG])[0])
     assert talk.watcher.states(goal) == STOPPED
     ended = talk.goal(goal)
     assert (ended["reason"], ended["message"]) == ("canceled", "Talk preempted: the goal was cancelled")
-    assert SHORTER.startswith(ended["spoken"])
-    assert "two" in ended["spoken"] != SHORTER
+    assert LONG.startswith(ended["spoken"])
+    assert "two" in ended["spoken"] != LONG
 
 
 def test_row_03_a_cancel_is_confirmed_within_150_ms_and_after_the_sound(talk: Talk) -> None:

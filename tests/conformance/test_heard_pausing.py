@@ -66,7 +66,7 @@ def assert_silent_for(talk: Talk, moment: float, seconds: float) -> None:
 
 @pytest.mark.parametrize(
     ("voice", "player", "word"),
-    [("espeak", "aplay", 3), ("espeak", "pacat", 5), ("joe", "aplay", 3)],
+    [("espeak", "aplay", 3), ("espeak", "pacat", 4), ("joe", "aplay", 3)],
     indirect=["voice"],
 )
 def test_row_43_a_paused_sentence_resumes_where_it_stopped(
