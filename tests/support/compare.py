@@ -266,18 +266,6 @@ def assert_resumed(heard: Recording | Samples, reference: Samples, pause: float,
     return length
 
 
-def find_part(part: Samples, wanted: Samples, reached: int, back: int) -> tuple[int, int] | None:
-    """Return where a part of a sentence's sound starts and ends, or None if it isn't a part of it.
-
-    `reached` is the number of samples that were heard before. The part may repeat the last `back` of them.
-    """
-    start = max(0, reached - back)
-    runs = _equal_runs(part, wanted[start:], 0, ahead=reached - start)
-    if not runs or runs[-1][0] + runs[-1][2] < len(part):
-        return None
-    return start + runs[0][1], start + runs[-1][1] + runs[-1][2]
-
-
 def _ran_dry(first: Samples, second: Samples, wanted: Samples, repeated: int) -> bool:
     """Return whether these are the two parts of a sentence in which a player ran dry (see `_compare_exactly`)."""
     runs = _equal_runs(first, wanted, 0)
