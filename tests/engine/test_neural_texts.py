@@ -1,6 +1,6 @@
 """Odd texts, spoken by a real neural voice: each ends once, with its words in order and a plausible duration.
 
-A default run speaks a few texts, and the slow tests speak 160. To choose the number, run `TALK_TEST_NEURAL_TEXTS=2000
+A default run speaks a few texts, and the slow tests speak 100. To choose the number, run `TALK_TEST_NEURAL_TEXTS=2000
 pytest -m slow -s tests/engine/test_neural_texts.py`. `TALK_TEST_SEED=N` makes other texts. Faults are printed.
 """
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-MANY = int(os.environ.get("TALK_TEST_NEURAL_TEXTS") or 160)
+MANY = int(os.environ.get("TALK_TEST_NEURAL_TEXTS") or 100)
 SEED = int(os.environ.get("TALK_TEST_SEED") or 18)
 #: The number of tests that share the texts, so that they can run in parallel.
 PARTS = 4
