@@ -138,15 +138,26 @@ def _read_tape(tape: Path) -> npt.NDArray[np.int16]:
     return np.frombuffer(tape.read_bytes()[: tape.stat().st_size // SAMPLE_BYTES * SAMPLE_BYTES], "<i2")
 
 
+def _listen() -> socket.socket:
+    """Return a listening socket, which is the sound server of the next player."""
+    folder = _opened.enter_context(short_directory())
+    listening = _opened.enter_context(socket.socket(socket.AF_UNIX))
+    listening.bind(f"{folder}/s")
+    listening.listen()
+    os.environ["PULSE_SERVER"] = f"unix:{folder}/s"
+    return listening
+
+
 def _cut_off(_: Path) -> PulsePlayer:
     """Return a player whose connection to the sound server breaks once it has a stream."""
-    folder = _opened.enter_context(short_directory())
-    relay = subprocess.Popen(["socat", f"UNIX-LISTEN:{folder}/s", f"UNIX-CONNECT:{_sinks[0].socket}"])
+    listening = _listen()
+    player = PulsePlayer(RATE)
+    with listening.accept()[0] as connection:
+        accepted = f"FD:{connection.fileno()}"
+        relay = subprocess.Popen(
+            ["socat", accepted, f"UNIX-CONNECT:{_sinks[0].socket}"], pass_fds=[connection.fileno()]
+        )
     try:
-        while not os.path.exists(f"{folder}/s"):
-            time.sleep(0.005)  # no event reports when socat listens
-        os.environ["PULSE_SERVER"] = f"unix:{folder}/s"
-        player = PulsePlayer(RATE)
         while player.device is None:
             _await(player)
     finally:
@@ -162,11 +173,7 @@ def _without_server(folder: Path) -> PulsePlayer:
 
 def _with_silent_server(_: Path) -> PulsePlayer:
     """Return a player whose server accepts connections, but never replies."""
-    folder = _opened.enter_context(short_directory())
-    listening = _opened.enter_context(socket.socket(socket.AF_UNIX))
-    listening.bind(f"{folder}/s")
-    listening.listen()
-    os.environ["PULSE_SERVER"] = f"unix:{folder}/s"
+    _listen()
     return PulsePlayer(RATE)
 
 
