@@ -180,7 +180,7 @@ class LoopConnection(Connection):
             self._watch = Watch(watched, max(0.0, min(due, self._limit) - now), self._run)
 
     def _end_waits(self, now: float) -> None:
-        """Wake the coroutines whose condition is true, whose deadline has passed, or whose connection has ended."""
+        """Wake the coroutines that are done or late, or all of them if the connection has ended."""
         for future, (done, deadline, _) in self._waits.items():
             if not future.done() and ((is_done := done()) or self.ended is not None or deadline <= now):
                 future.set_result(is_done)

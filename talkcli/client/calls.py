@@ -306,7 +306,10 @@ class Saying:
 
 
 class Paused:
-    """An asynchronous context manager that pauses all speech until its block ends. Its value is the paused goal."""
+    """An asynchronous context manager that pauses all speech during its block.
+
+    Its value is the paused goal, if any.
+    """
 
     def __init__(self, client: ClientCalls, seconds: float) -> None:
         """Prepare a pause of at most this number of seconds, without connecting."""

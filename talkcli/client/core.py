@@ -508,7 +508,7 @@ class ClientCore:
             self.fail(exchange, self.unanswered(exchange))
 
     def answer(self, exchange: Exchange) -> tuple[JsonObject, list[JsonObject]]:
-        """Return the reply to a request and the list items that came with it. Raise the error if the request failed.
+        """Return the reply to a request with its list items. Raise the error of a failed request.
 
         Raises:
             RequestRefused: the server refused the request.
@@ -711,10 +711,7 @@ class ClientCore:
         self._fail_all()
 
     def disconnected(self, why: str, now: float) -> None:
-        """Record that the connection has broken, and fail all unanswered requests.
-
-        Also end the watches that don't reconnect.
-        """
+        """Record a broken connection. Fail unanswered requests, and end watches that don't reconnect."""
         self.absence = self._last_error or why
         self.absent_since, self._last_error, self._sending_ended = now, None, None
         self.greeted = False

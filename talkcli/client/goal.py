@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class GoalCalls(TrackedGoal):
-    """The base class of goal handles, with methods that never wait, and coroutines for the calls that do."""
+    """The base class of goal handles. The methods that wait are coroutines."""
 
     def __init__(self, connection: Connection, goal: Goal) -> None:
         super().__init__(goal)

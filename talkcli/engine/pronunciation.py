@@ -147,7 +147,7 @@ class Pronunciations:
                     break
 
     def spoken_form(self, text: str, text_format: str) -> str | None:
-        """Return a readable form of a goal's text as it is spoken, or None if the text is spoken as it was sent."""
+        """Return a readable form of a text as it is spoken, or None if it is spoken as it was sent."""
         if text_format == MARKDOWN:
             from talkcli.engine.markdown import blank_markdown  # this import is slow and rarely needed
 

@@ -56,7 +56,10 @@ _OTHER_FILES = {
 
 
 class SoundError(Exception):
-    """Raised with a reason and a message if a sound doesn't exist or can't be played. The message says what to do."""
+    """Raised with a reason and a message if a sound doesn't exist or can't be played.
+
+    The message says what to do.
+    """
 
 
 @frozen

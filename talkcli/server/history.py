@@ -107,7 +107,7 @@ class History:
         self._schedule_write()
 
     async def search(self, request: PendingRequest, filters: Mapping[str, object], count: int) -> list[Row]:
-        """Return the rows of the newest goals that pass all filters, oldest first. Meanwhile, the request waits.
+        """Search the history while the request waits. Return the newest matching rows, oldest first.
 
         Raises:
             RequestRefused: the file can't be read, or the disk doesn't respond in time.

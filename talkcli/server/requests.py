@@ -150,7 +150,7 @@ class Requests:
             each.resume()
 
     def _reserve_memory(self, pending: PendingRequest) -> bool:
-        """Reserve memory for a waiting request. If too many requests wait, store the refusal and return False.
+        """Reserve memory for a waiting request. If too many wait, store a refusal and return False.
 
         In this case, the request is carried out without waiting, and the refusal rejects its goal.
         """
@@ -289,7 +289,7 @@ class Requests:
         pending.answer(length=len(record.say.text), state=record.state.name)
 
     def _require_producer(self, record: Record, connection: ClientConnection) -> None:
-        """Let only this connection add text to a goal. Raise RequestRefused if another connection already does.
+        """Let only this connection add text to a goal. Raise RequestRefused if another one already does.
 
         A new connection may continue a text if the old one is gone and the sender chose the goal's id.
         """

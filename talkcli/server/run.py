@@ -240,9 +240,9 @@ class Server:
         return None
 
     def _maintain_socket(self) -> None:
-        """Bind the socket again if clients can't find it, and schedule the next check.
+        """If clients can't find the socket, bind it again or shut down. Schedule the next check.
 
-        If binding fails for good, shut down.
+        Shut down only if binding fails for good.
         """
         self._socket_check = self._loop.call_later(SOCKET_CHECK_S, self._maintain_socket)
         if self._listener.in_place():
@@ -330,11 +330,7 @@ class Server:
     # -- shutdown
 
     def _begin_shutdown(self, cause: TalkError | None = None) -> None:
-        """Start to shut down: end all goals and reject new ones.
-
-        Args:
-            cause: the error that caused the shutdown, if any.
-        """
+        """Start to shut down: end all goals and reject new ones. `run` raises `cause` at the end."""
         self._fatal_error = cause or self._fatal_error
         self._systemd.notify_stopping()
         self._requests.shut_down()
@@ -349,7 +345,7 @@ class Server:
             connection.stream.abort()
 
     def _on_signal(self, number: signal.Signals) -> None:
-        """Log the signal, and start to shut down."""
+        """Log a signal and start to shut down. A second signal will end the server immediately."""
         log.write(f"stopping after {signal.Signals(number).name}")
         for each in self._end_signals:
             # A second signal ends the server immediately, without the event loop, which may be busy.

@@ -172,7 +172,7 @@ class ClientStream:
         return len(self._unread)
 
     def adjust_held_bytes(self, added_bytes: int) -> None:
-        """Change the size of the receiver's held output. If the total exceeds the limit, disconnect slow clients."""
+        """Change the size of the held output. If the total is too large, disconnect slow clients."""
         if self in self._streams.open:
             self.held_bytes += added_bytes
             self._streams.unread_bytes += added_bytes
@@ -268,7 +268,7 @@ class ClientStream:
 
 
 def raise_descriptor_limit(clients: int) -> int:
-    """Raise the limit of open files for this many clients, as far as the system allows. Return the limit."""
+    """Try to raise the limit of open files for this many clients. Return the limit."""
     wanted = clients + RESERVED_DESCRIPTORS + OWN_DESCRIPTORS
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     allowed, most = (2**31 if each == resource.RLIM_INFINITY else each for each in limits)

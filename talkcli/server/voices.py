@@ -29,7 +29,7 @@ class VoiceCatalog:
         self.driver: str | None = None
 
     def look_up(self, voice: str | None, settings_voice: str | None = None) -> tuple[str | None, Refusal | None]:
-        """Return the id or name of the voice that a client asked for, and a refusal if the voice isn't available.
+        """Return the id or name of the requested voice, and a refusal if the voice isn't available.
 
         For a neural voice, the first value is the id. For every other voice, it is the client's input. The default
         voice is never checked, and other voices are not checked before the engine has listed its voices.

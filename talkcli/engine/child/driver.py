@@ -147,7 +147,7 @@ def _available_drivers() -> list[str]:
 
 
 def _make_run_loop_step(driver_name: str) -> Callable[[], None]:
-    """Return a function that runs macOS's event loop once if the driver needs it, and otherwise does nothing."""
+    """Return a function that runs macOS's event loop once, or does nothing if the driver doesn't need it."""
     if sys.platform != "darwin" or driver_name not in _RUN_LOOP_DRIVERS:
         return lambda: None
     from Foundation import NSDate, NSRunLoop  # type: ignore[import-not-found,unused-ignore]
@@ -353,7 +353,7 @@ class Driver:
         self._proxy.notify("finished-utterance", completed=runner.duration is not None)
 
     def _write_samples(self, text: str, playback: Playback) -> float:
-        """Send a text's speech or a sound to the playback. Return the sound's length, or infinity for speech."""
+        """Pass speech or a sound to the playback. Return the length of a sound, or infinity for speech."""
         runner, settings = self._runner, self._sound
         if runner.sound is not None:
             from talkcli.engine.child.sounds import play_sound  # rarely needed

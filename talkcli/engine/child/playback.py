@@ -350,7 +350,7 @@ class Playback:
             self._clock.add(TimedWord(*found, self._seconds(self._part_begin) + audio_start))
 
     def write(self, samples: bytes) -> None:
-        """Send samples to the player, except silence at the end. Wait until the player has accepted them.
+        """Send samples except silence at the end, and wait until the player has accepted them.
 
         If all samples so far are silent, they are stored until the first sound follows.
         """
@@ -482,7 +482,7 @@ class Playback:
         return PlayerFeed(player, self._rate, self._clock, self._seconds(self._begin), lead_in)
 
     def _release_failed_player(self, error: CannotSpeak) -> None:
-        """Release the failed player, so that another one can replace it. Raise an error if there is no replacement.
+        """Release the failed player, so that another can replace it. If there is none, raise an error.
 
         There is no replacement if some of the sound may have been heard, or if no other player is left.
         """
@@ -525,7 +525,7 @@ class Playback:
     # -- steps
 
     def _send_all(self, feed: PlayerFeed) -> None:
-        """Send all samples to the player except silence at the end. Wait until the player has accepted them.
+        """Send all samples except silence at the end, and wait until the player has accepted them.
 
         Play silence during a pause.
         """

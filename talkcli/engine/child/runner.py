@@ -476,7 +476,7 @@ class GoalRunner:
             self._goal.error = exception
 
     def _handle_driver_finished(self, name: str | None, completed: bool, **_: object) -> None:
-        """End the goal when the driver has finished, unless a pause or an interruption has stopped the driver."""
+        """End the goal when the driver has finished, unless a pause or an interruption stopped the driver."""
         goal = self._goal
         if goal is None or name != goal.id:  # the notification is for an earlier goal
             return

@@ -594,7 +594,7 @@ class Supervisor:
             self._post(EngineMissing(message))
 
     def _release_process(self, process: EngineProcess) -> None:
-        """Close the descriptors of a process that has exited. End the goal that was waiting for the exit, if any."""
+        """Close the descriptors of an exited process. End the goal that was waiting for the exit, if any."""
         del self._watched[process.liveness]
         if self._watched.pop(process.stderr, None):
             process.read_stderr()

@@ -114,7 +114,7 @@ class PlayerProcess:
             self.exit = io.FileIO(os.pidfd_open(self.pid))
 
     def poll(self) -> int | None:
-        """Return the exit status, or None while the program runs. Kill processes that the program has left behind.
+        """Return the exit status, or None while the program runs. Kill any processes it has left behind.
 
         This also reaps the program. If a signal killed it, the status is the negative number of the signal. The program
         counts as running until all processes that it has started have exited.
