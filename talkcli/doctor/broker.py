@@ -246,8 +246,9 @@ class BrokerExamination:
                 return judge_server_status(self._robot, server, time.monotonic() - began)
         except TalkError as error:
             wrong, _, remedy = error.message.partition("; ")
-            step = f"read the bridge's log on {self._robot}: journalctl -u talk-bridge"
-            return failure("bridge", wrong, remedy or step)
+            step = f"on {self._robot}, read the bridge's log: journalctl -u talk-bridge"
+            rules = f"if it reports nothing, compare {self._robot}'s access rules with: talk bridge --print-acl"
+            return failure("bridge", wrong, remedy or f"{step}; {rules}")
 
     def _run_limited(self, function: Callable[[], _Result]) -> _Result:
         """Run a blocking function in a thread. Return its result. Raise TimeoutError if it takes too long.
