@@ -103,7 +103,8 @@ class Publisher:
                     if self.server:
                         self._set_server(None, ServerStatus({}, None, (), ()), "")
             except TalkError as error:
-                log.write_limited("server", f"not connected to the server: {log.sanitize(str(error))}")
+                words = " ".join(str(error).split())
+                log.write_limited("server", f"not connected to the server: {log.sanitize(words)}")
             await asyncio.sleep(random.uniform(0, self._retry_s))
             self._retry_s = min(_LAST_SERVER_RETRY_S, self._retry_s * 2)
 
