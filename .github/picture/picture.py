@@ -144,7 +144,7 @@ def _environment(place: str) -> dict[str, str]:
 
 
 def _serve(stack: contextlib.ExitStack, env: dict[str, str]) -> None:
-    """Start a server that ends with `stack`, and wait until its engine is ready."""
+    """Start a server that `stack` stops at the end, and wait until its engine is ready."""
     server = subprocess.Popen(
         [sys.executable, "-m", "talkcli", "serve", "--player", "null", "--rate", "120"],
         env=env,

@@ -62,7 +62,7 @@ def _request_goals(client: Client, count: int, filters: dict[str, Any]) -> list[
 
 
 def _read_history(options: CommonOptions, request: Log, error: ServerUnavailable) -> list[Goal]:
-    """Return goals from the history, because no server is running. Print a note about this.
+    """Return goals from the history of a server that isn't running. Print a note about this.
 
     Args:
         options: the common options, which may name the server's socket.

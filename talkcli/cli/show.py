@@ -331,7 +331,7 @@ def terminal_columns(stream: TextIO) -> int:
 
 
 def _wrap(text: str) -> str:
-    """Wrap a message to the width of the terminal, but break no line within a command."""
+    """Wrap a message to the width of the terminal, but keep each command on one line."""
     columns = terminal_columns(sys.stderr)
     if all(len(line) <= columns for line in text.split("\n")):
         return text

@@ -114,7 +114,7 @@ class Pronunciations:
             self._lengths[pieces[0].lower()].add(len(pieces))
 
     def apply(self, text: str, start: int = 0, end: int | None = None) -> SpokenText:
-        """Replace the terms in a text or a part of it. Return the part as a SpokenText.
+        """Replace the terms in a text, or in a part of it. Return the result as a SpokenText.
 
         The part begins at the offset `start`. It ends before `end`, or at the end of the text if `end` is None.
         """

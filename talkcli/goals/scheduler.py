@@ -75,7 +75,7 @@ class Interruption:
 
 @frozen
 class PauseChange:
-    """An effect that tells clients about a pause of speech or its end."""
+    """An effect that tells clients about the start or the end of a pause."""
 
     paused: bool
     #: the goal that is being spoken, or None
@@ -1015,7 +1015,7 @@ class Scheduler:
         return self._end_unqueued(record, reason, details, by, now)
 
     def _end_unqueued(self, record: Record, reason: Reason, details: str, by: By | None, now: Now) -> list[Effect]:
-        """End a pending goal that isn't in the queue as RECALLED. Return the effects."""
+        """End a pending goal outside the queue as RECALLED. Return the effects."""
         record.change_state(State.RECALLING)
         return self._end(record, State.RECALLED, reason, f"not spoken: {details}", by, now)
 

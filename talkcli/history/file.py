@@ -94,9 +94,9 @@ class HistoryWriter:
         self._clock_offset, self._steady_since = math.inf, 0.0
 
     def write(self, goals: Sequence[Goal], damaged_file: FileIdentity | None = None) -> str | None:
-        """Write goals, and delete goals that are too old or don't fit. Return a message about any new file.
+        """Write goals, and delete old ones. Return a message if a removed or damaged file was replaced.
 
-        If the file was removed or is damaged, start a new one. All goals are written in one transaction.
+        Goals are deleted if they are too old or don't fit. All goals are written in one transaction.
 
         Args:
             goals: the goals, in the order in which they ended.

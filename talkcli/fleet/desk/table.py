@@ -158,7 +158,7 @@ class FleetTranscript:
         self._boots: dict[str, str] = {}
 
     def begin(self, robots: Sequence[Presence], broker: str, screen: Screen, now: float) -> list[str]:
-        """Start the transcript with these robots. Return its heading, which counts them.
+        """Start the transcript. Return a heading that says how many robots there are.
 
         `broker` is the broker's address.
         """
