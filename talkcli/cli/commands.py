@@ -179,7 +179,7 @@ _SERVE_OPTIONS = (
     option(
         "--lead-in",
         goal_options.MILLISECONDS,
-        "Play TIME of silence, such as 300ms, if the output was idle. "
+        "Play silence for TIME, such as 0.3s, if the output was idle. "
         "HDMI, USB and Bluetooth outputs then don't swallow the first word.",
         default=0,
         limits=(0, goal_options.MAX_LEAD_IN_MS),
@@ -600,7 +600,7 @@ _ROWS = (
         talk --json fleet status | jq -r 'select(.presence.online | not).robot'
         talk fleet watch
         """,
-        options=(replace(_LONG, help="Show full ids. 'status' also shows versions and start times."),),
+        options=(replace(_LONG, help="Show full ids. With 'status', also show versions and start times."),),
         argument=Option("action", WORD, metavar="WHAT", choices=("status", "watch")),
     ),
     Command(

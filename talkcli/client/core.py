@@ -450,7 +450,7 @@ class ClientCore:
         self._unsent.append((line, exchange))
         early, self._sent_early = self._sent_early, b""
         if not line.startswith(early):
-            raise AssertionError(f"the early request {early!r} differs from the request {line!r}")
+            raise AssertionError(f"the request that was sent early, {early!r}, differs from {line!r}")
         if early:
             self.mark_sent(len(early))
 

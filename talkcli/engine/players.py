@@ -196,7 +196,7 @@ def _parse_custom_command(player: str, device: str | None, rate: int) -> PlayerC
     except ValueError as error:
         raise PlayerMissing(f"invalid player command {player!r}: {str(error).lower()}") from error
     if not parts:
-        raise PlayerMissing("the player command is empty; name a program that reads samples")
+        raise PlayerMissing("the player command is empty; name a program that plays standard input")
     argv = [part.replace("{rate}", str(rate)).replace("{device}", device or "default") for part in parts]
     if not on_path(argv[0]):
         raise PlayerMissing(f'player "{argv[0]}" not found')

@@ -538,7 +538,7 @@ OPTIONS = (
         "milliseconds of silence before the sentence, even if another sentence has just ended; 0 means none",
         limits=(0, MAX_LEAD_IN_MS),
         unit=" milliseconds",
-        help="Play TIME of silence, such as 300ms, before the sentence. 0 means none. [default: the server's setting]",
+        help="Play silence for TIME, such as 300ms, before the sentence. 0 means none. [default: the server's setting]",
         for_engine=True,
     ),
     Option(

@@ -296,7 +296,7 @@ class Requests:
         if not record.more or self._producers.get(record) is connection:
             return
         if record.say.id is None or not self._lacks_producer(record):
-            raise RequestRefused(f"the text of goal {record.id} comes from another connection", "not_sender")
+            raise RequestRefused(f"another connection is already sending the text of goal {record.id}", "not_sender")
         self._producers[record] = connection
 
     def _lacks_producer(self, record: Record) -> bool:

@@ -70,7 +70,7 @@ def test_only_its_own_connection_may_add_text(soundless: Talk) -> None:
         for goal_id in (begin(client), begin(client, id="mine/1")):
             reply = other.request("append", id=goal_id, text="Two.")
             assert (reply["error"]["code"], reply["state"] in ("ACTIVE", "PENDING")) == ("not_sender", True)
-            assert reply["error"]["message"] == f"the text of goal {goal_id} comes from another connection"
+            assert reply["error"]["message"] == f"another connection is already sending the text of goal {goal_id}"
         assert other.request("append", id="4k7f-99", text="Two.")["error"]["code"] == "unknown_goal"
         assert other.request("cancel")["ok"]
 
