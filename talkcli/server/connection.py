@@ -59,7 +59,7 @@ class Handler(Protocol):
     greeting: bytes
 
     def joined(self, connection: ClientConnection) -> None:
-        """Admit a new client, make it wait for room, or refuse it."""
+        """Admit a new client, let it wait until another one leaves, or refuse it."""
 
     def left(self, connection: ClientConnection) -> None:
         """Remove a client that has disconnected."""
@@ -164,7 +164,7 @@ class PendingRequest:
             self.connection.send(reply)
 
     def _step(self, in_time: bool | None) -> None:
-        """Run the coroutine until it waits or ends. Its last call of `wait` returns `in_time`.
+        """Run the coroutine until it waits or ends. Its pending call of `wait` returns `in_time`.
 
         At the start, there is no such call, and `in_time` is None.
         """

@@ -268,7 +268,7 @@ class Server:
     # -- called by connections
 
     def joined(self, connection: ClientConnection) -> None:
-        """Admit a new client, make it wait for room, or refuse it."""
+        """Admit a new client, let it wait until another one leaves, or refuse it."""
         pid, uid = peers.credentials(connection.stream.socket)
         # Other users may connect only if the socket's mode allows it.
         if uid not in {os.getuid(), 0} and not self._listener.mode & 0o066:

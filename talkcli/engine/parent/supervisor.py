@@ -310,7 +310,7 @@ class Supervisor:
             self._shut_down()
 
     def _wait_and_handle(self, until: float) -> None:
-        """Wait until messages or actions arrive or a deadline passes, and process them."""
+        """Wait for messages and actions, at most until the time `until`, and process them."""
         watched = dict.fromkeys([self._actions.fileno(), *self._watched], select.POLLIN)
         if self._process:
             watched[self._process.socket.fileno()] = self._process.socket_events
