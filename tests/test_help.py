@@ -157,12 +157,6 @@ def test_a_command_in_a_message_is_not_wrapped() -> None:
         assert " ".join(line.strip() for line in lines) == message.strip()
 
 
-def test_the_error_for_a_wrong_value_names_its_variable() -> None:
-    assert alone("serve", TALK_RATE="fast").err.startswith(
-        "talk: --rate (env var: 'TALK_RATE'): must be a whole number, got 'fast'"
-    )
-
-
 def test_a_missing_player_is_reported_at_the_start(make_talk: MakeTalk) -> None:
     first = make_talk("--player", "aply").log.splitlines()[0]
     assert first == "talk: player \"aply\" not found; nothing can be heard; did you mean 'aplay'?"

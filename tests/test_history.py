@@ -153,15 +153,11 @@ def test_a_history_needs_sqlite(tmp_path: Path) -> None:
     assert "talk: --history needs the module sqlite3, which this Python lacks" in done.stderr
 
 
-def make_full(directory: str) -> None:
-    fill(directory)
-
-
 def make_read_only(directory: str) -> None:
     subprocess.run(["mount", "-o", "remount,ro", directory], check=True)
 
 
-@pytest.mark.parametrize(("spoil", "restarts"), [(make_full, False), (make_read_only, True)])
+@pytest.mark.parametrize(("spoil", "restarts"), [(fill, False), (make_read_only, True)])
 def test_a_full_or_read_only_disk_is_reported_once_and_speech_goes_on(
     make_talk: MakeTalk, tmp_path: Path, spoil: Callable[[str], None], *, restarts: bool
 ) -> None:

@@ -12,6 +12,7 @@ import pytest
 
 from talkcli import peers
 from talkcli.goals.options import MAX_LOG_GOALS
+from tests.test_watch import number
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -19,11 +20,6 @@ if TYPE_CHECKING:
     from tests.support.processes import Talk
 
 LONG = "please step back from the door and from the lift " * 5
-
-
-def numbers(ids: list[str]) -> list[str]:
-    """Return the short form of goal ids that lists show."""
-    return [goal_id.partition("-")[2] for goal_id in ids]
 
 
 @pytest.fixture
@@ -45,7 +41,7 @@ def test_a_line_shows_time_state_text_sender_and_reason(scripted: Talk, history:
     done = scripted.run("log")
     assert (done.code, done.err) == (0, "")
     lines = done.out.splitlines()
-    assert [line.split()[2] for line in lines] == numbers(history)
+    assert [line.split()[2] for line in lines] == [*map(number, history)]
     states = ["SUCCEEDED", "ABORTED", "REJECTED", "RECALLED", "PREEMPTED"]
     assert [line.split()[1] for line in lines] == states
     assert all(re.match(r"\d\d:\d\d:\d\d  \w", line) for line in lines)
@@ -68,14 +64,12 @@ def test_a_line_shows_time_state_text_sender_and_reason(scripted: Talk, history:
 
 def test_log_shows_the_latest_goals_oldest_first(scripted: Talk) -> None:
     assert (scripted.run("log").out, scripted.run("log").code, scripted.run("--json", "log").out) == ("", 0, "")
-    goals = [scripted.request("say", text=f"length=0 {number}", wait=True)["goal"] for number in range(22)]
+    goals = [scripted.request("say", text=f"length=0 {each}", wait=True)["goal"] for each in range(22)]
     history = [goal["id"] for goal in goals]
     scripted.run("wait")
-    assert [line.split()[2] for line in scripted.run("log").out.splitlines()] == numbers(history[-20:])
-    assert [line.split()[2] for line in scripted.run("log", "-n", "2").out.splitlines()] == numbers(history[-2:])
-    assert [line.split()[2] for line in scripted.run("log", "--count", str(MAX_LOG_GOALS)).out.splitlines()] == numbers(
-        history
-    )
+    for options, ids in (([], history[-20:]), (["-n", "2"], history[-2:]), (["--count", str(MAX_LOG_GOALS)], history)):
+        lines = scripted.run("log", *options).out.splitlines()
+        assert [line.split()[2] for line in lines] == [*map(number, ids)]
 
 
 def test_a_script_that_starts_talk_through_another_program_is_shown(tmp_path: Path) -> None:

@@ -356,18 +356,14 @@ def test_without_the_extra_neural_voices_are_listed_but_refused(env: dict[str, s
         assert run([*TALK, "say", "--wait", "a"], env).code == 0
 
 
-def heard(env: dict[str, str], *options: str) -> object:
-    """Return the voice that spoke a sentence."""
-    return json.loads(run([*TALK, "--json", "say", "--wait", *options, "a"], env).out)["voice"]
-
-
 def test_a_drivers_voice_precedes_a_neural_voice_of_the_same_name(env: dict[str, str], tmp_path: Path) -> None:
     tiny_voice.put(tmp_path / "voices", "en")
-    with serving(env, *_to_file(env), "--voice", "en"):
-        assert heard(env) == "gmw/en"
-        assert run([*TALK, "set", "--voice", "tiny"], env).code == 0
-        used = [heard(env, "--voice-only", "--voice", voice) for voice in ("en-us", "EN", "gmw/en-US")]
-        assert used == ["piper/tiny", "piper/tiny", "gmw/en-US"], "the language of a neural voice selects that voice"
+    with _robot(env, "--voice", "en") as robot:
+        assert robot.heard(robot.say("a", None)) == ("SUCCEEDED", "gmw/en")
+        robot.client.set(voice="tiny")
+        goals = [robot.say(voice=voice, voice_only=True) for voice in ("en-us", "EN", "gmw/en-US")]
+        used = [robot.heard(goal)[1] for goal in goals]
+        assert used == [TINY, TINY, "gmw/en-US"], "the language of a neural voice selects that voice"
 
 
 #: System calls that change a file or use the internet, successful or not.

@@ -229,15 +229,6 @@ def test_only_as_much_input_is_read_as_can_be_kept(scripted: Talk) -> None:
         client.wait(10)
 
 
-def test_lines_wait_for_room_and_none_is_lost(make_talk: MakeTalk) -> None:
-    talk = make_talk("--max-queue", "3", scripted=True)
-    lines = [f"length=0.02 {number}" for number in range(10)]
-    done = talk.run("say", "--lines", stdin="".join(f"{line}\n" for line in lines))
-    assert (done.code, done.err, len(set(done.out.split()))) == (0, "", len(lines))
-    talk.watcher.wait_for_terminal(done.out.split()[-1])
-    assert talk.watcher.texts("SUCCEEDED") == lines
-
-
 def test_several_hundred_lines_are_spoken_per_second(make_talk: MakeTalk) -> None:
     talk = make_talk(scripted=True, watched=False)
     lines = [f"length=0 {number}" for number in range(300)]

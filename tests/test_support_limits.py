@@ -26,12 +26,6 @@ def control() -> Iterator[MakeControl]:
     take_unmeasured()  # keep these out of the summary
 
 
-def test_a_result_in_time_is_measured(control: MakeControl) -> None:
-    with limits(control(0.09)):
-        assert_within(0.1, 0.1, "it")
-    assert take_unmeasured() == []
-
-
 def test_a_late_result_beside_a_late_control_is_not_measured(control: MakeControl) -> None:
     continued = False
     with limits(control(0.03, early=2)):  # it is timed again after the late result

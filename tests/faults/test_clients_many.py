@@ -205,17 +205,6 @@ CLIENTS = 60
 RECOVERY_S = 5.0
 
 
-def limit_descriptors(files: int, command: list[str]) -> list[str]:
-    return ["sh", "-c", f'ulimit -n {files}; exec "$@"', "sh", *command]
-
-
-def kill_engine(pid: int) -> int:
-    """Kill a server's engine process, and return its id."""
-    (engine,) = children(pid)
-    os.kill(engine, signal.SIGKILL)
-    return engine
-
-
 @contextlib.contextmanager
 def connected(path: str) -> Iterator[list[socket.SocketIO]]:
     """Connect 60 clients at once."""
@@ -251,16 +240,6 @@ def admitted(clients: list[socket.SocketIO]) -> list[socket.SocketIO]:
     return inside
 
 
-def assert_status(client: socket.SocketIO) -> None:
-    """Assert that this client gets the status in time."""
-    with limits():
-        started_at = time.monotonic()
-        client.write(b'{"seq": 7, "request": "status"}\n')
-        while receive(client).get("seq") != 7:
-            pass
-        assert_within(time.monotonic() - started_at, 0.1, "status without descriptors")
-
-
 def wait_for_descriptors(pid: int, most: int) -> None:
     assert usage.wait_until(pid, lambda now: now.descriptors <= most).descriptors <= most, usage.describe(pid)
 
@@ -268,7 +247,8 @@ def wait_for_descriptors(pid: int, most: int) -> None:
 def test_60_clients_leave_the_engine_enough_of_40_descriptors(home: str) -> None:
     path = f"{home}/s"
     env = environment(home, TALK_SOCKET=path)
-    with serving(env, command=limit_descriptors(40, [*SERVE, "--rate", "450"])) as server:
+    command = ["sh", "-c", 'ulimit -n 40; exec "$@"', "sh", *SERVE, "--rate", "450"]
+    with serving(env, command=command) as server:
         pid = server.process.pid
         assert run([*TALK, "say", "--wait", "hello"], env).code == 0
         wait_for_descriptors(pid, 20)
@@ -276,7 +256,12 @@ def test_60_clients_leave_the_engine_enough_of_40_descriptors(home: str) -> None
         with connected(path) as clients:
             inside = admitted(clients)
             assert 5 <= len(inside) < CLIENTS
-            assert_status(inside[0])
+            with limits():
+                started_at = time.monotonic()
+                inside[0].write(b'{"seq": 7, "request": "status"}\n')
+                while receive(inside[0]).get("seq") != 7:
+                    pass
+                assert_within(time.monotonic() - started_at, 0.1, "status without descriptors")
             # This client is refused at first, tries again, and is admitted when others disconnect.
             with processes.start_talk(["say", "--wait", "late"], env) as late:
                 time.sleep(0.5)
@@ -287,7 +272,8 @@ def test_60_clients_leave_the_engine_enough_of_40_descriptors(home: str) -> None
         wait_for_descriptors(pid, before)
         with connected(path) as clients:
             inside = admitted(clients)
-            engine = kill_engine(pid)  # a new engine needs descriptors
+            (engine,) = children(pid)
+            os.kill(engine, signal.SIGKILL)  # a new engine needs descriptors
             end = time.monotonic() + RECOVERY_S
             while children(pid) in ([], [engine]):
                 assert time.monotonic() < end, "no new engine was started"

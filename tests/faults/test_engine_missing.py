@@ -109,11 +109,6 @@ def too_few_descriptors(talk: Talk) -> Iterator[None]:
     resource.prlimit(talk.pid, resource.RLIMIT_NOFILE, allowed)
 
 
-def _scripted_engine(talk: Talk) -> int:
-    (engine,) = usage.descendants(talk.pid)
-    return engine
-
-
 def _replaced(talk: Talk, engine: int, number: signal.Signals = signal.SIGKILL) -> int:
     """Kill the engine process, wait for the next one, and return its id."""
     os.kill(engine, number)
@@ -161,7 +156,8 @@ def test_an_engine_killed_again_during_its_restarts_costs_one_goal(scripted: Tal
         first = start_goal(talk, "never-ends", number=1)
         goals = [send(talk, "length=0.01") for _ in range(WAITING)]
         talk.script_start("hang")  # so that the engine can be killed during each start
-        engine = _replaced(talk, _scripted_engine(talk))
+        (engine,) = usage.descendants(talk.pid)
+        engine = _replaced(talk, engine)
         engine = _replaced(talk, engine, signal.SIGSEGV)
         talk.script_start("")
         killed = time.monotonic()

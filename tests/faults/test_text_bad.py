@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import random
 import re
@@ -24,6 +25,7 @@ from tests.support.reference import Sentence
 from tests.support.reference import render as reference
 from tests.support.timing import assert_within, limits
 from tests.tools.fuzz_texts import SENTENCES, Case, list_voices, speak_all
+from tests.tools.fuzz_texts import cases as mutated_texts
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -33,6 +35,8 @@ if TYPE_CHECKING:
     from tests.support.processes import Talk
     from tests.support.sink import Sink
 
+#: Seconds of the slow test of mutated texts, or TALK_TEST_FUZZ seconds if that is set.
+_FUZZ_S = float(os.environ.get("TALK_TEST_FUZZ") or (30 if os.environ.get("CI") else 5))
 #: Number of characters of a text in the test of every character.
 _TEXT_CHARS = 1000
 #: All characters are tested in CI, and if TALK_TEST_FUZZ is set. Otherwise, one in 20 or 200 is.
@@ -73,7 +77,7 @@ ENDLESS = {
 QUICK = ("letters", "signs", "points", "letters with points", "accents", "blanks")
 
 
-def assert_rendered(path: Path, text: str, voice: str = "en") -> None:
+def assert_rendered(path: Path, text: str, voice: str) -> None:
     """Assert that a text has the same samples as with libespeak-ng itself."""
     render(text, str(path), voice=voice)
     with wave.open(str(path)) as file:
@@ -81,11 +85,6 @@ def assert_rendered(path: Path, text: str, voice: str = "en") -> None:
             voice,
             text,
         )
-
-
-def test_markup_and_phonemes_are_spoken_as_text(tmp_path: Path) -> None:
-    for text in MARKUP:
-        assert_rendered(tmp_path / "x.wav", text)
 
 
 def test_libespeak_commands_in_a_text_are_ignored(talk: Talk) -> None:
@@ -131,8 +130,8 @@ def test_numbers_of_up_to_20_digits_are_spoken() -> None:
     assert set(tally.outcomes) == {"completed"}
 
 
-def test_very_long_words_and_right_to_left_scripts_are_spoken_whole(tmp_path: Path) -> None:
-    for voice, text in RENDERED:
+def test_markup_long_words_and_right_to_left_scripts_are_spoken_whole(tmp_path: Path) -> None:
+    for voice, text in [*RENDERED, *(("en", text) for text in MARKUP)]:
         assert_rendered(tmp_path / "x.wav", text, voice)
 
 
@@ -270,3 +269,17 @@ def test_texts_that_crash_some_voices_are_spoken_by_all_of_them() -> None:
     voices = [voice for voice in list_voices() if voice.split("/")[0] in {"gmq", "aav", "inc", "dra"}]
     tally = speak_all([Case(voice, text) for voice in voices for text in ("'-o", ".-す", "…-o x")], guarded=True)
     assert (tally.deaths, tally.faults) == ([], [])
+
+
+@pytest.mark.parametrize("growing", [False, True], ids=["whole", "growing"])
+@pytest.mark.parametrize("count", [25, pytest.param(None, marks=pytest.mark.slow)])
+@pytest.mark.timeout(int(_FUZZ_S) + 300)
+def test_mutated_texts_end_once_and_never_overflow_a_buffer(count: int | None, growing: bool) -> None:
+    before = len(os.listdir("/proc/self/fd"))
+    texts = itertools.islice(mutated_texts(7, list_voices()), count)
+    tally = speak_all(texts, guarded=True, seconds=_FUZZ_S, growing=growing)
+    print(tally, *tally.deaths, sep="\n")
+    assert not tally.faults, tally.faults
+    assert not tally.overflows, tally.overflows
+    assert tally.texts > (20 if count else _FUZZ_S)
+    assert len(os.listdir("/proc/self/fd")) == before
