@@ -282,9 +282,9 @@ class Bridge:
         self._link.subscribe(*wanted, retained=False)
 
     def _on_subscribed(self, topic: str, code: int) -> None:
-        """Process the broker's answer to a subscription. Go online if the robot may read its requests.
+        """Go online if the broker allows the robot to read its requests. Otherwise, disconnect for a while.
 
-        If it may not, disconnect, and try again later.
+        If the broker doesn't allow another subscription, only log this.
         """
         if code >= REASON_FAILURE:
             words = f"the broker does not allow this robot to read {topic} (reason 0x{code:02x})"
@@ -390,14 +390,14 @@ class Bridge:
     # -- messages
 
     def _on_message(self, message: Message) -> None:
-        """Process a message from the broker. Log any exception as a bug."""
+        """Pass a message from the broker to `_handle_message`. Log any exception as a bug."""
         try:
             self._handle_message(message)
         except Exception as error:  # noqa: BLE001 - no message may crash the bridge
             log.write_bug("a message from the broker", error)
 
     def _handle_message(self, message: Message) -> None:
-        """Process an echo, a presence message or a client's request from the broker."""
+        """React to an echo, a presence message or a client's request from the broker."""
         if message.topic == self._echo_topic:
             self._handle_echo(message.payload)
             return
@@ -444,7 +444,7 @@ class Bridge:
             self._policy.record_echo(sent_at, boottime())
 
     def _handle_presence(self, payload: bytes) -> None:
-        """Process a presence message. End this bridge if an older bridge has the same name.
+        """React to a presence message. End this bridge if an older bridge has the same name.
 
         Tell a younger bridge that the name is taken. The message may come from this bridge, an earlier one, or another
         one with the same robot name.
@@ -500,7 +500,10 @@ class Bridge:
         self._publish(Message(self._echo_topic, f"{self._session} {self._echo_at}".encode()))
 
     def _tick(self) -> None:
-        """Check for timeouts, send an echo, and renew the presence if due. Schedule the next tick."""
+        """End silent sessions and connections, send an echo, and renew the presence if it is due.
+
+        Schedule the next tick.
+        """
         self._tick_timer = self._loop.call_later(ECHO_EVERY_S, self._tick)
         self._sessions.tick()
         self._publisher.tick()

@@ -146,7 +146,7 @@ class Publisher:
     # -- from the server
 
     def _receive(self, server: LocalConnection, lines: list[bytes]) -> None:
-        """Process replies and events from the server. Log malformed lines."""
+        """Decode lines from the server, and pass on the replies and events. Log malformed lines."""
         for line in lines:
             try:
                 message = decode(line)
@@ -181,7 +181,7 @@ class Publisher:
         self.schedule_status()
 
     def _receive_event(self, server: LocalConnection, message: JsonObject, line: bytes) -> None:
-        """Process an event. If a goal or the pause has changed, publish the event and schedule a status."""
+        """Store what an event changes. If a goal's state or the pause has changed, publish the event."""
         event = from_json(message)
         if isinstance(event, StateChanged):
             self._update_goals(event)

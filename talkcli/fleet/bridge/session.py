@@ -106,7 +106,7 @@ class RemoteSessions:
     # -- from the broker
 
     def submit(self, request: RemoteRequest) -> None:
-        """Pass a request to its client's session, or refuse it if there are too many sessions."""
+        """Pass a request to its client's session, or to a new one. Refuse it if there are too many."""
         key = request.user, request.reply_topic
         session = self._sessions.get(key) or RemoteSession(self, *key)
         if key in self._sessions or self._make_room(request.user, urgent=isinstance(request.request, Cancel | Status)):
@@ -495,7 +495,7 @@ class RemoteSession:
         self._clean_up()
 
     def _receive(self, lines: list[bytes]) -> None:
-        """Process lines from the server, and publish them for the client."""
+        """Publish lines from the server for the client. Leave out private texts."""
         answers: list[_ReplyLine] = []
         for line in lines:
             try:
@@ -517,7 +517,7 @@ class RemoteSession:
         self._end_if_done()
 
     def _process_answer(self, message: JsonObject) -> list[_ReplyLine]:
-        """Process one line of an answer. Return the lines for the client. Add a token to the answer to `hello`."""
+        """Convert one line of an answer to lines for the client. Add a token to the answer to `hello`."""
         assert self._server
         exchange = self._server.match(message)
         if not isinstance(exchange, _RemoteExchange):
@@ -546,7 +546,7 @@ class RemoteSession:
         return [_ReplyLine(each, remote_request.correlation, token) for each in lines]
 
     def _record_say_reply(self, exchange: _RemoteExchange, state: State | None, *, refused: bool) -> None:
-        """Process the reply to a `say` request. Record whether its goal is pending.
+        """Record from the reply to a `say` request whether the goal is pending.
 
         Forget the id of a refused goal.
         """

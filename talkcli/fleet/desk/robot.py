@@ -331,7 +331,7 @@ class RobotConnection(Connection):
         return self._desk.prepare(now)
 
     def process(self, ready: Collection[int]) -> None:
-        """Process the messages from the broker."""
+        """Receive messages from the broker, and pass them to `on_message`."""
         self._desk.process(ready)
 
     def keep_alive(self) -> None:
@@ -352,7 +352,7 @@ class RobotConnection(Connection):
             self._mark_absent(why)
 
     def on_message(self, message: Message) -> None:
-        """Process a message from the broker: the robot's presence, or lines from its server."""
+        """Update the robot's presence from a message, or pass on lines from its server."""
         with self.changed:
             if message.topic == topics.robot(self.robot, topics.PRESENCE):
                 self._update_presence(message.payload)
@@ -503,7 +503,10 @@ class RobotConnection(Connection):
             self._publish(exchange)
 
     def dispatch(self, message: JsonObject, now: float) -> Exchange | None:
-        """Process a message from the server or the bridge. Return the completed exchange, if any."""
+        """Pass a message to its exchange or to the listeners. Return the exchange that it ends, if any.
+
+        The message `gone` of the bridge ends the connection.
+        """
         if message.get("event") == "gone":
             self.end(printable(str(message.get("message") or "the connection to the server was lost")))
             return None

@@ -268,7 +268,7 @@ class FleetRequestCalls:
             each.connection.on_disconnected(why)
 
     def on_message(self, message: Message) -> None:
-        """Process a presence message, or lines from a robot's server."""
+        """Pass a presence message, or lines from a server, to the robot's RobotRequest."""
         _, kind, *_, name, last = message.topic.split("/")
         if kind != topics.ROBOT_LEVEL:
             self._on_reply(last, message)
@@ -306,7 +306,7 @@ class FleetRequestCalls:
             robot.send()
 
     def _on_reply(self, name: str, message: Message) -> None:
-        """Process lines from a robot. Include the robot if it answers a request to its group.
+        """Pass on lines from a robot. Include the robot if it answers a request to its group.
 
         If a robot answers a request to a group, it is a member of the group, even if it seemed to be absent.
         """

@@ -230,7 +230,7 @@ class FleetWatch:
             self._events.append(BrokerAway(why, ABSENCE_LIMIT_S))
 
     def on_message(self, message: Message) -> None:
-        """Process a presence, status or event message of a robot.
+        """Report the change or the event that a robot's message contains.
 
         On a new connection, first collect all retained messages.
         """
