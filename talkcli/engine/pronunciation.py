@@ -127,7 +127,7 @@ class Pronunciations:
         return SpokenText(text, start, end, replacements)
 
     def _find(self, text: str, start: int) -> Iterator[tuple[int, int, str]]:
-        """Yield the start, the end and the replacement of each term after an offset."""
+        """Yield the start, the end and the replacement of each term found after an offset."""
         # A regular expression for all terms would take seconds for a long text.
         pieces, joined, end = list(_PIECE.finditer(text, start)) if self.terms else [], list[str](), start
         for piece in pieces:

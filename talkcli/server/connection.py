@@ -301,10 +301,7 @@ class ClientConnection(asyncio.Protocol):
         self._schedule_work()
 
     def publish(self, event: bytes, *, feedback: bool = False) -> None:
-        """Send an encoded event. If the client reads too slowly, hold back feedback.
-
-        Only the newest feedback is kept, and older feedback is dropped.
-        """
+        """Send an encoded event. If the client reads too slowly, keep only the newest feedback for later."""
         if feedback and self.stream.congested:
             self._held_feedback = event
         else:

@@ -91,7 +91,7 @@ class Subscribers:
             waiting.pop(connection, None)
 
     def state_changed(self, record: Record, state: State, at: float) -> None:
-        """Publish a goal's new state. If the goal has ended, send the result and end its subscriptions."""
+        """Publish a goal's new state. If the goal has ended, send the result and end the subscriptions to it."""
         event = StateChanged(record.id, state, at, next(self._numbers))
         if self._watchers:
             # The first and the last event of a goal contain the whole goal.

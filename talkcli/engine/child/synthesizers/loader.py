@@ -179,7 +179,7 @@ class ModelLoader:
         return model
 
     def mark_spoken(self, voice: str) -> None:
-        """Schedule a memory measurement after a voice has spoken.
+        """After a voice has spoken, schedule a memory measurement.
 
         The first sentences with a voice need memory that is never freed.
         """
