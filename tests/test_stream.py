@@ -304,6 +304,7 @@ async def test_connections_are_accepted_when_a_descriptor_is_free_again(
     with FullSocket(socket.AF_UNIX) as listening, socket.socket(socket.AF_UNIX) as client:
         listening.bind(str(tmp_path / "s"))
         listening.listen()
+        listening.setblocking(False)
         client.connect(str(tmp_path / "s"))
         acceptor = Acceptor(accepted.append, 10_000)
         acceptor.open(listening)
