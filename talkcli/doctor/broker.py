@@ -451,7 +451,7 @@ def judge_rights(user: str, unwritable: tuple[str, ...], unreadable: tuple[str, 
 
 
 def judge_server_status(robot: str, server: JsonObject, response_s: float) -> Finding:
-    """Check the status of the robot's server. Return the finding."""
+    """Check whether the robot's server is paused and its engine works. Return the finding."""
     words = f"{robot} answered in {response_s * 1000:.0f} ms: {summarize_server(server)}"
     if server.get("paused") is True:
         return warning("bridge", f"{describe_pause(server)}; {words}", f"talk --robot {robot} resume")

@@ -138,7 +138,7 @@ class LocalExamination:
         yield from voice.check_neural(used, options, SENTENCE_LIMIT_S, server_voices if self._client else None)
 
     def _check_sound(self) -> Iterator[Finding]:
-        """Check the sound output. Yield the findings.
+        """Check the player, its device, the sound cards and the volume. Yield the findings.
 
         Record whether the sound server hangs.
         """

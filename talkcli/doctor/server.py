@@ -249,7 +249,7 @@ def judge_server(server: JsonObject, log: Sequence[Goal], now: float) -> list[Fi
 
 
 def _judge_state(server: JsonObject, now: float) -> Finding:
-    """Check the server's state. Return the finding."""
+    """Check the server's pause, engine and version. Return the finding."""
     version, words = server.get("version"), summarize_server(server)
     if server.get("paused") is True:
         words = f"{describe_pause(server)}; {words}"
@@ -276,7 +276,7 @@ def summarize_server(server: JsonObject) -> str:
 
 
 def _judge_settings(server: JsonObject) -> Finding:
-    """Check the server's settings. Return the finding.
+    """Return a finding that lists the server's settings, after checking the volume.
 
     It is a warning or failure if the volume is too low.
     """

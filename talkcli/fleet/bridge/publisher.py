@@ -169,7 +169,7 @@ class Publisher:
         self._set_server({**fields(server.server), "features": features}, status, server.boot)
 
     def _set_server(self, server_info: JsonObject | None, status: ServerStatus, boot: str) -> None:
-        """Replace the stored state of the server and its goals, and report the change."""
+        """Replace the stored state of the server and its goals, and call `on_server_change`."""
         self.server = server_info
         self._active = status.active.id if status.active else None
         self._interrupted = {each.id for each in status.interrupted}
