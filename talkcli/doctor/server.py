@@ -276,7 +276,7 @@ def summarize_server(server: JsonObject) -> str:
 
 
 def _judge_settings(server: JsonObject) -> Finding:
-    """Return a finding that lists the server's settings, after checking the volume.
+    """Check the volume setting. Return a finding that lists all of the server's settings.
 
     It is a warning or failure if the volume is too low.
     """
