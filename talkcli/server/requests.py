@@ -507,7 +507,7 @@ def _goal_items(name: str, records: Iterable[Record]) -> Iterator[JsonObject]:
 
 
 def _filter_values(record: Record) -> JsonObject:
-    """Return the values of a goal in memory that the filters of `log` need."""
+    """Return the values of a goal in memory that `log` can filter by."""
     say, state = record.say, record.state.name
     values: JsonObject = {"state": state, "name": record.sender.name, "key": say.key, "text": say.text}
     return {**values, "ended_at": record.ended_at or 0.0}

@@ -422,7 +422,7 @@ class GoalRunner:
                 self._send_to_driver(goal)
 
     def _send_to_driver(self, goal: ActiveGoal) -> None:
-        """Send the text to the driver, beginning at the last word heard."""
+        """Pass the goal's text to the driver. A third-party driver starts again at the last word heard."""
         goal.progress_at = goal.resumed_at = time.monotonic()
         goal.offset = goal.last_word
         goal.with_driver, goal.interrupted = True, False

@@ -299,7 +299,7 @@ def _read_private_bytes() -> int | None:
 
 
 def _trim_heap() -> None:
-    """Return freed memory to the system, which takes 1 to 13 ms.
+    """Give freed memory back to the system. This takes 1 to 13 ms.
 
     Otherwise, glibc would keep most of the memory of an unloaded model.
     """
