@@ -200,16 +200,17 @@ def test_a_connection_lost_at_any_byte_ends_playback_with_a_reason(make_rig: Mak
 
 
 def test_a_move_to_a_dummy_reported_with_the_end_fails_the_sentence(make_rig: MakeRig, sink: Sink) -> None:
-
     with make_rig() as rig, dummy_of(sink):
         player = PulsePlayer(RATE)
         try:
+            while player.device is None:
+                rig.wait(player)
+            # move the newest stream, because one of the previous test may still exist
+            streams = [int(line.split("\t")[0]) for line in sink.pactl("list", "short", "sink-inputs").splitlines()]
             rig.feed(player)
             rig.relay.silent_at = rig.relay.forwarded
             player.close()
             rig.relay.pump()
-            # move the newest stream, because one of the previous test may still exist
-            streams = [int(line.split("\t")[0]) for line in sink.pactl("list", "short", "sink-inputs").splitlines()]
             sink.pactl("move-sink-input", str(max(streams)), DUMMY_SINK)
             end = time.monotonic() + 2 * SECONDS
             while (rest := end - time.monotonic()) > 0:
