@@ -416,13 +416,14 @@ def test_a_goal_ends_once_when_its_process_is_gone_or_overdue(monkeypatch: pytes
     undying = UndyingProcess()
     process = cast("EngineProcess", undying)
     engine = _make_supervisor(process, posted)
-    monkeypatch.setattr(engine, "_start_process", lambda: None)
+    starts: list[float] = []
+    monkeypatch.setattr(engine, "_start_process", lambda: starts.append(time.monotonic()))
     engine._goal = SupervisedGoal(YES, sent=True, started=True)
     engine._kill_process("it hangs", Reason.ENGINE_HUNG)
     due = engine._dying[process]
     engine._handle_deadlines(due - KILL_LIMIT_S / 2)
     assert [type(report).__name__ for report in posted] == ["EngineDied"]
-    assert undying.kills == 1
+    assert (undying.kills, len(starts)) == (1, 1), "the next process waited for the dying one"
     if not in_time:
         engine._handle_deadlines(due)
         assert undying.kills == 2

@@ -133,10 +133,6 @@ def random_text(source: random.Random) -> str:
     return text
 
 
-def _letter(source: random.Random) -> str:
-    return source.choice("abcdefghijklmnopqrstuvwxyzéßжшλ")
-
-
 # -- original texts
 
 
