@@ -54,14 +54,10 @@ class FleetFaults(FaultInjector):
         super().__init__(rng)
         self._talk, self._broker, self._bridge, self._proxy = talk, broker, bridge, proxy
         self.outages = Outages()
-        kinds = (
-            self.broker_killed,
-            self.bridge_killed,
-            self.bridge_stopped,
-            self.server_killed,
-            self.connection_stalled,
-        )
-        self.kinds = {kind.__name__: kind for kind in (*kinds, proxy.cut)}
+        killed = (self.broker_killed, self.bridge_killed, self.server_killed)
+        self.kinds = {
+            kind.__name__: kind for kind in (*killed, self.bridge_stopped, self.connection_stalled, proxy.cut)
+        }
 
     def broker_killed(self) -> None:
         self._broker.kill()

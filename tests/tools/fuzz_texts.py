@@ -223,16 +223,8 @@ def _change_letters(source: random.Random, text: str) -> str:
 
 
 _ORIGINS: tuple[Callable[[random.Random], str], ...] = (
-    *(
-        _sentence,
-        _sentence,
-        lambda source: source.choice(CRASHERS),
-        _words_of_several_languages,
-        _neighbouring_characters,
-        _any_characters,
-        _pieces,
-    ),
-    _repeated,
+    *(_sentence, _sentence, lambda source: source.choice(CRASHERS), _words_of_several_languages),
+    *(_neighbouring_characters, _any_characters, _pieces, _repeated),
 )
 _MUTATIONS: tuple[Callable[[random.Random, str], str], ...] = (
     *(_double, _cut, _insert, _insert, _splice),

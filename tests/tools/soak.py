@@ -1,6 +1,6 @@
 """Soak test of a server: many clients send goals of all kinds, and there is a fault every few seconds.
 
-    python -m tests.tools.soak --seconds 1800 [--seed N] [--every SECONDS | --kills] [--player aplay|pacat]
+    python -m tests.tools.soak --seconds 1800 [--seed N] [--every SECONDS | --kills]
 
 Each goal must have exactly one end, each goal that SUCCEEDED must have been heard, and the server must not use more
 resources at the end than at the beginning. With `--kills`, the only fault is a killed engine, up to twice per second,
@@ -30,6 +30,7 @@ from tests.tools.soak_interjecting import interject, read_stories, tell_stories
 
 #: Clients that send usual goals, and that send growing texts, and pairs of clients of which one interrupts the other.
 _CLIENTS, _GROWING_CLIENTS, _INTERJECTING_CLIENTS = 8, 3, 2
+_PLAYER = "aplay"
 #: Goals before the first count of resources. By then, the history is almost full, and all code has run once.
 _WARM_UP_GOALS = 1_200
 _WARM_UP_LIMIT_S = 300.0
@@ -52,11 +53,11 @@ class Report:
 class Soak:
     """A server with a sink, clients and a monitor."""
 
-    def __init__(self, seed: int, player: str, stack: contextlib.ExitStack) -> None:
-        self._seed, self._player = seed, player
+    def __init__(self, seed: int, stack: contextlib.ExitStack) -> None:
+        self._seed = seed
         self._sink = stack.enter_context(Sink())
         self._temporary = stack.enter_context(short_directory())
-        options = ("--player", player, "--max-queue", "20")
+        options = ("--player", _PLAYER, "--max-queue", "20")
         self._talk = Talk(options, sink=self._sink, env={"TMPDIR": self._temporary}, watched=False)
         stack.callback(self._talk.close)
         with self._talk.connect() as wire:
@@ -89,7 +90,7 @@ class Soak:
         return report
 
     def _disturb(self, seconds: float, every: float | None, min_faults: int) -> Report:
-        faults = RobotFaults(self._talk, self._sink, self._player, random.Random(f"{self._seed} faults"))
+        faults = RobotFaults(self._talk, self._sink, _PLAYER, random.Random(f"{self._seed} faults"))
         clients = self._start_senders("")
         narrator = Narrator(self._talk, self._sink, faults.calm_since)
         clients.start("narrator", narrator.run)
@@ -145,7 +146,6 @@ def soak(
     seconds: float,
     seed: int,
     every: float | None = 5.0,
-    player: str = "aplay",
     min_faults: int = 0,
     warm_up: int = _WARM_UP_GOALS,
 ) -> Report:
@@ -155,7 +155,7 @@ def soak(
     """
     print(f"seed {seed}", flush=True)
     with contextlib.ExitStack() as stack:
-        return Soak(seed, player, stack).run(seconds, every, min_faults, warm_up)
+        return Soak(seed, stack).run(seconds, every, min_faults, warm_up)
 
 
 def assert_no_bug(*logs: str) -> None:
@@ -175,9 +175,8 @@ def parser(every: float) -> argparse.ArgumentParser:
 def main() -> None:
     arguments = parser(every=5.0)
     arguments.add_argument("--kills", action="store_true", help="only kill the engine, up to twice per second")
-    arguments.add_argument("--player", choices=("aplay", "pacat"), default="aplay")
     options = arguments.parse_args()
-    print(soak(options.seconds, options.seed, None if options.kills else options.every, options.player))
+    print(soak(options.seconds, options.seed, None if options.kills else options.every))
 
 
 if __name__ == "__main__":

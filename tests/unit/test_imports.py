@@ -249,24 +249,3 @@ def test_a_client_imports_no_slow_modules(statement: str, without: list[str]) ->
         [sys.executable, "-c", code], cwd=PACKAGE.parent, capture_output=True, text=True, timeout=60, check=False
     )
     assert (done.returncode, done.stdout.split(), done.stderr) == (0, [], "")
-
-
-def test_contributing_names_every_file_that_handles_an_option() -> None:
-    """The document's example is the option --ttl."""
-    text = (PACKAGE.parent / ".github" / "CONTRIBUTING.md").read_text("utf-8")
-    steps = text.partition("**An option of `say`**")[2].partition("\n\nMany parts of `talk` read the row")[0]
-    named = {module_name(PACKAGE / path) for path in re.findall(r"talkcli/([\w/]+\.py)", steps)}
-    having = {module for module in sources() if re.search(r"\bttl\b", ast.unparse(sources()[module]))}
-    # In a fleet, a ttl is also the expiry of a message. No other option is handled there.
-    having -= {module for module in having if part(module) == "fleet"}
-    assert named - having == {"engine.protocol"}  # the engine does not get the ttl
-    # Examples and help of commands, the doctor's sentence, requests that wait for room, and messages.
-    assert having - named == {
-        "cli.commands",
-        "doctor.sentence",
-        "cli.stdin",
-        "client.core",
-        "goals.reasons",
-        "server.requests",
-    }
-    assert len(having) <= 12
