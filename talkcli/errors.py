@@ -156,7 +156,7 @@ def refusal(code: str, message: str, items: list[dict[str, object]] | None = Non
 
 
 def memory_hint() -> str:
-    """Return a hint about this process's memory limit, for an error message."""
+    """Return words for an error message: this process's memory limit, or what to check if there is none."""
     import resource  # rarely needed, and slow to import
 
     # Each memory limit, its unit, and the shell command and systemd option that change it.

@@ -187,7 +187,7 @@ def history_file(option: str, socket: str) -> str:
 
 
 def history_files(named: str | None) -> list[str]:
-    """Return the possible paths of the history files of all servers that a client tries.
+    """Return the possible paths of history files, for all servers that a client tries.
 
     If `named` is given, it is the path of the only server's socket. Otherwise, only the last one is the socket of the
     system-wide server.

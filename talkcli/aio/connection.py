@@ -40,10 +40,10 @@ class Watch:
         self._descriptors, self._callback = tuple(watched), callback
         for descriptor, events in watched.items():
             if events & POLLIN:
-                self._loop.add_reader(descriptor, self._end)
+                self._loop.add_reader(descriptor, self._on_ready)
             if events & POLLOUT:
-                self._loop.add_writer(descriptor, self._end)
-        self._timer = None if timeout == NEVER else self._loop.call_later(timeout, self._end)
+                self._loop.add_writer(descriptor, self._on_ready)
+        self._timer = None if timeout == NEVER else self._loop.call_later(timeout, self._on_ready)
 
     def cancel(self) -> None:
         """Stop watching, without calling the function. Do nothing if the watch has ended."""
@@ -54,8 +54,8 @@ class Watch:
         if self._timer:
             self._timer.cancel()
 
-    def _end(self) -> None:
-        """Stop watching, and call the function."""
+    def _on_ready(self) -> None:
+        """Stop watching, and call the callback. A descriptor is ready, or the time is up."""
         self.cancel()
         self._callback()
 

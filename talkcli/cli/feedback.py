@@ -123,7 +123,7 @@ class _TerminalFeedback(Feedback):
             if line:
                 line.paused = event.paused
         else:
-            # The line may show another goal until the event's goal is spoken.
+            # Until the goal of this event is spoken, the line may show another goal.
             if line is None or (line.goal.id != goal.id and _is_spoken(event)):
                 line = self._line = _GoalLine(goal)
             if line.goal.id == goal.id:

@@ -150,7 +150,7 @@ class LineBuffer:
         return self._lines[0] if self._lines else None
 
     def take(self) -> InputLine:
-        """Remove and return the line that `first` has returned."""
+        """Remove and return the first line."""
         return self._lines.popleft()
 
     def take_expired(self, now: float) -> Iterator[InputLine]:
@@ -477,7 +477,7 @@ class LineSpeaker(InputSpeaker):
         data = self._wait_unless_input(pause, wants_input=self._wants_input)
         if data is not None:
             self._buffer.feed(data, time.monotonic())
-            if not idle:  # read from the server even if there is always more input
+            if not idle:  # Even if the input never pauses, the server's messages must be read.
                 wait(time.monotonic(), interruptible=False)
 
     def _report_and_forget_goals(self) -> None:

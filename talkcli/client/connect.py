@@ -49,7 +49,7 @@ _START_OWN_STEP = "or start your own server with: talk serve"
 
 @frozen
 class ConnectionAttempt:
-    """The state of an attempt to connect to a server."""
+    """The progress of connecting: the open socket, the paths that failed, and what was sent and received."""
 
     #: the non-blocking socket, or None if no connection was accepted
     socket: _socket.socket | None

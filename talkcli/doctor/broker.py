@@ -1,4 +1,4 @@
-"""Checks of an MQTT broker and one of its robots.
+"""Functions that check an MQTT broker and one of its robots.
 
 The checks use the rights of an operator, or those of the robot's bridge if the login is the robot's name. They have no
 side effects, because the broker doesn't retain the test messages, and bridges ignore them.

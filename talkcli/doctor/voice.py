@@ -99,7 +99,7 @@ class EngineReport:
 
 @frozen
 class VoiceTrial:
-    """The loading time, speed and memory use of a neural voice, or its fault."""
+    """The loading time, speed and memory use of a neural voice, or the reason why it failed."""
 
     #: loading time in seconds, or None if the voice was not loaded
     load_s: float | None = None

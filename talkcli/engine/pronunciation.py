@@ -238,6 +238,6 @@ class PronunciationFile:
             self._report(f"{self.path}, {each}; the line is left out")
 
     def describe(self) -> JsonObject:
-        """Read the file again if it has changed. Return its path, number of terms and problems for `status`."""
+        """Read the file again if it has changed. Return its path, term count and problems for `status`."""
         terms, problems = len(self.refresh().terms), [*filter(None, [self._problem]), *self._faults]
         return {"file": self.path, "terms": terms, "problems": problems}

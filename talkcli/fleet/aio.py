@@ -72,7 +72,7 @@ class Fleet(FleetCalls[FleetRequest]):
     """
 
     async def robots(self) -> list[Presence]:
-        """Return all robots of the fleet, sorted by name. This includes robots that are offline."""
+        """Read the presence of all robots of the fleet, even offline ones, and return it sorted by name."""
         found = await read_robots(self._broker, ANSWER_LIMIT_S, with_status=False, wait=wait_ready)
         return [each.presence for each in found]
 

@@ -137,9 +137,7 @@ class Fleet(FleetCalls["FleetRequest"]):
     """
 
     def robots(self) -> list[Presence]:
-        """Return all robots of the fleet, sorted by name.
-
-        This includes robots that are offline.
+        """Read the presence of all robots of the fleet, even offline ones, and return it sorted by name.
 
         Raises:
             ServerUnavailable: The broker can't be reached.

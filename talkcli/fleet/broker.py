@@ -115,7 +115,7 @@ def require_paho() -> None:
 
 
 def client_user(broker: Broker) -> str:
-    """Return the user name for topics: the login's name, or else the local user's name.
+    """Return the user name for topics. Without a login, this is the name of the local user.
 
     Raises:
         UsageError: the name isn't allowed in a topic.

@@ -94,7 +94,7 @@ def is_denied(code: int) -> bool:
 
 
 class Link:
-    """A single connection to the MQTT broker, which is never reconnected.
+    """A single connection to the MQTT broker. It doesn't reconnect.
 
     Any thread may use it. Callbacks run in the thread that calls `read`.
     """

@@ -94,7 +94,7 @@ class SpeechPause:
     #: the beginning and the end, in seconds since 1970 UTC. The end is None if only `resume` ends the pause.
     at: float
     until: float | None
-    #: monotonic time of the end, or inf
+    #: monotonic time when the pause ends, or inf
     ends_at: float
 
 
@@ -955,7 +955,7 @@ class Scheduler:
         return None
 
     def _interrupt_active(self) -> list[Effect]:
-        """Interrupt the active goal if an interjection is waiting. Return the order, if any.
+        """Interrupt the active goal if an interjection is waiting. Return the order for the engine, if any.
 
         Another interjection is only interrupted by one with a higher priority. A goal that preempts is not interrupted
         by an older interjection, because it goes before that in the queue, too.

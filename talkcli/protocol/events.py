@@ -75,7 +75,7 @@ def unfinished(status: ServerStatus) -> list[Goal]:
 
 @frozen
 class Canceled:
-    """The goals that a request cancelled, and the goals named in it that had already ended."""
+    """The goals that a request cancelled, and those of its goals that had already ended."""
 
     #: the goals that were cancelled
     canceled: tuple[Goal, ...]

@@ -62,7 +62,7 @@ class _Worker:
             raise TalkError(f"can't start the history's threads: {memory_hint()}") from error
 
     def _run(self) -> None:
-        """Run the queued functions until None ends the thread."""
+        """Run the queued functions. End the thread when None is in the queue."""
         while function := self.functions.get():
             function()
 

@@ -64,7 +64,7 @@ class VoiceCatalog:
             return 0
 
     def _find(self, voice: str, settings_voice: str | None) -> Voice | None:
-        """Return the voice that matches the client's input, if any.
+        """Return the voice that matches the client's input, if any. For a language, prefer the settings' voice.
 
         Read directories only if necessary.
         """

@@ -25,7 +25,7 @@ _MIN_NAME_COLUMNS = 18
 _MIN_ID_COLUMNS = 12
 #: The minimum width to assume for a terminal, because shorter lines would be useless.
 MIN_COLUMNS = 40
-#: The maximum width of the text column if lines can have any length. A longer text shifts the columns after it.
+#: The usual width of the text column if lines can have any length. Longer texts shift the columns after them.
 TEXT_COLUMNS = 40
 #: The minimum width of a text if whole ids and process ids are shown.
 _MIN_TEXT_COLUMNS = 16
@@ -259,7 +259,7 @@ class MeasuredText:
         return "".join(self._shown[start:end])
 
     def _first_shown(self, column: int, max_index: int) -> int:
-        """Return the index of the first character to show to the right of `column`, at most `max_index`."""
+        """Return the index of the first character right of `column`. Return `max_index` if that is smaller."""
         if column <= 0:
             return 0
         # The ellipsis takes one more column. The first visible character must not be a combining mark.

@@ -518,7 +518,7 @@ class Playback:
         self.release_player()
 
     def _release_and_rewind(self, feed: PlayerFeed) -> None:
-        """Kill a player. Rewind the sentence to the first sound that may be unheard."""
+        """Kill a player. Rewind the sentence to the first sound that was perhaps not heard."""
         feed.record_progress(time.monotonic(), all_written=False)
         self._release_and_continue_at(self._find_unheard_offset() if feed.player.proven else self._begin)
 
@@ -658,7 +658,7 @@ class Playback:
             self._on_word(replace(word, position=word.position - self._seconds(self._skipped)))
 
     def _find_unheard_offset(self) -> int:
-        """Return the offset in bytes, from the sentence's start, of the first sound that may be unheard."""
+        """Return the byte offset in the sentence of the first sound that was perhaps not heard."""
         heard = self._clock.heard_seconds(time.monotonic()) - REPEATED_SOUND_S
         return min(self._sent, max(self._begin, self._samples.begin, int(max(0.0, heard) * self._rate) * SAMPLE_BYTES))
 

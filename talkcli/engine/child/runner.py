@@ -152,7 +152,7 @@ class ActiveGoal:
         return self._markdown.read(text, ended=ended) if self._markdown else text
 
     def speech_seconds(self, now: float) -> float:
-        """Return how many seconds a third-party driver has spoken the goal, not counting pauses."""
+        """Return the seconds for which a third-party driver has spoken the goal, without pauses."""
         return self.spoken_s + (now - self.resumed_at if self.with_driver else 0.0)
 
 

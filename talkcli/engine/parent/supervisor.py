@@ -582,7 +582,7 @@ class Supervisor:
         goal.sent, goal.stop_due, goal.hold_due = False, NEVER, NEVER
 
     def _handle_failed_start(self, message: str, *, permanent: bool = False) -> None:
-        """Schedule another start. Fail the waiting goal if it can't wait any longer.
+        """Schedule another start of the engine. Fail the waiting goal if it can't wait any longer.
 
         It can't wait if the error is permanent or the goal has waited too long.
         """

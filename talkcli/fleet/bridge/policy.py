@@ -157,7 +157,7 @@ class Policy:
         return f"{self._session} {now}"
 
     def decide(self, message: Message, kind: str, user: str, now: float) -> RemoteRequest | Refusal | Goodbye | Ignored:
-        """Decide whether a message is accepted, refused or ignored, or ends its client's session.
+        """Decide whether to accept, refuse or ignore a message, or to end its client's session.
 
         Args:
             message: a message on a request topic of the robot or one of its groups.

@@ -96,7 +96,7 @@ class DeskLink:
         self.link: Link | None = None
         #: the error if an attempt to connect failed, or if the broker rejected the marker message or a subscription
         self.failure: TalkError | None = None
-        #: when the marker message came back after the retained messages (monotonic time), or None until then
+        #: monotonic time when the marker message came back after the retained messages. None until then
         self.marker_at: float | None = None
         #: functions that process messages and rejected requests. `process` calls them when the link isn't locked.
         self._calls: deque[Callable[[], object]] = deque()

@@ -141,7 +141,7 @@ def _format_row(cells: dict[str, Cell], widths: dict[str, int], screen: Screen) 
 
 
 class FleetTranscript:
-    """A transcript of what the robots say and do, in lines of text.
+    """A transcript, line by line, of what the robots say and do.
 
     Each line begins with the time and the robot's name.
     """

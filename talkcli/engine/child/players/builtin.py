@@ -210,7 +210,7 @@ class WavStreamPlayer(BuiltInPlayer):
         return written - header
 
     def interests(self) -> list[Interest]:
-        """Return the output's descriptor with the poll event POLLOUT."""
+        """Return the output's descriptor, to wait until it accepts data."""
         return [(self._output, select.POLLOUT)]
 
     def wake_at(self) -> float:

@@ -222,7 +222,7 @@ class PulsePlayer(Player):
             pass
 
     def _advance_stream(self) -> bool:
-        """Open, check or drain the stream if necessary. Return whether to run libpulse again."""
+        """Open, update or drain the stream if necessary. Return whether to run libpulse again."""
         if self._error is not None or self._drained:
             return False
         state = self._lib.context_get_state(self._context)
