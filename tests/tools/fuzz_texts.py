@@ -1,6 +1,6 @@
 """Speak mutated texts with all voices in engine processes, as `say -o` does, and count the crashes.
 
-    python -m tests.tools.fuzz_texts --count 20000 [--seed N | --seed today] [--seconds N] [--no-guard] [--growing]
+    python -m tests.tools.fuzz_texts --count 20000 [--seed N | --seed today] [--seconds N] [--growing]
 
 It prints each text that crashed a process as a Python literal. The exit code is 1 if a goal didn't have exactly one
 end, if a process hung or printed a traceback, if a word isn't in its place, or if a text overflowed a buffer in spite
@@ -357,15 +357,14 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=20_000)
     parser.add_argument("--seconds", type=float, default=float("inf"))
     parser.add_argument("--seed", default="1", help='a number, or "today"')
-    parser.add_argument("--no-guard", action="store_true")
     parser.add_argument("--growing", action="store_true", help="send each text in pieces")
     options = parser.parse_args()
     seed = daily_seed() if options.seed == "today" else int(options.seed)
     texts = itertools.islice(cases(seed, list_voices()), options.count)
-    tally = speak_all(texts, guarded=not options.no_guard, seconds=options.seconds, growing=options.growing)
+    tally = speak_all(texts, guarded=True, seconds=options.seconds, growing=options.growing)
     print(*tally.deaths, *map("fault: {}".format, tally.faults), sep="\n")
     print(f"seed {seed}: {tally}, {len(tally.overflows)} overflows")
-    return 1 if tally.faults or (tally.overflows and not options.no_guard) else 0
+    return 1 if tally.faults or tally.overflows else 0
 
 
 if __name__ == "__main__":
