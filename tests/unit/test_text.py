@@ -77,6 +77,11 @@ def test_a_text_is_limited_in_characters_and_in_bytes(longest: str, limit: int, 
     assert bad_text(f"{longest}a", None) is None, "without a limit, a text may have any length"
 
 
+def test_a_text_has_at_most_ten_thousand_characters() -> None:
+    assert bad_text("a" * 10_000) is None
+    assert bad_text("a" * 10_001) == ("text_too_long", "the text is too long: 10,001 characters (at most 10,000)")
+
+
 @given(
     st.text(st.characters(exclude_categories=[])) | st.text(st.characters(categories=["Zs", "Cc", "Cf", "Cn", "Cs"]))
 )
