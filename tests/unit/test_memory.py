@@ -72,6 +72,14 @@ def test_texts_are_limited_to_8_mib_and_the_oldest_is_dropped_first() -> None:
     assert (kept.state, kept.reason, kept.snapshot().text) == (State.SUCCEEDED, "canceled", None)
 
 
+def test_the_limit_of_texts_counts_bytes_not_characters() -> None:
+    recent = RecentGoals()
+    first, second = ended(1, text="🤖" * (1024 * 1024)), ended(2, text="a" * (4 * 1024 * 1024 + 1))
+    recent.add(first)
+    recent.add(second)
+    assert (first.snapshot().text, second.snapshot().text is None) == (None, False)
+
+
 def test_dropping_a_text_also_drops_the_spoken_part() -> None:
     record = ended(1)
     record.started_at, record.begun_end = 2.0, 4
