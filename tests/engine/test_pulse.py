@@ -209,9 +209,8 @@ def test_a_move_to_a_dummy_reported_with_the_end_fails_the_sentence(make_rig: Ma
             streams = [int(line.split("\t")[0]) for line in sink.pactl("list", "short", "sink-inputs").splitlines()]
             rig.feed(player)
             rig.relay.silent_at = rig.relay.forwarded
-            player.close()
-            rig.relay.pump()
             sink.pactl("move-sink-input", str(max(streams)), DUMMY_SINK)
+            player.close()
             end = time.monotonic() + 2 * SECONDS
             while (rest := end - time.monotonic()) > 0:
                 poll = select.poll()
