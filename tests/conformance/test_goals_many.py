@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 CLIENTS = 5
 #: Row 17 asks for 45 seconds. A shorter test runs unless TALK_TEST_SOAK is set.
-SECONDS = float(os.environ.get("TALK_TEST_SOAK", "5"))
+SECONDS = float(os.environ.get("TALK_TEST_SOAK", "15"))
 BURST = 1_000
 #: Number of goals per batch, so that the client itself takes little time.
 BATCH = 50

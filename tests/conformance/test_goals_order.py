@@ -179,6 +179,17 @@ def test_a_cancel_reports_more_goals_than_the_output_buffer_holds(make_talk: Mak
     assert_event_order(talk)
 
 
+def test_all_clients_get_their_results_at_shutdown_even_beyond_the_output_limit(make_talk: MakeTalk) -> None:
+    count = 150
+    talk, _, _ = start_full_server(make_talk)
+    with talk.connect() as wire, ThreadPoolExecutor() as pool:
+        for _ in range(count):
+            send_patient(wire, "🤖" * 9_900)
+        reasons = pool.submit(lambda: [wire.receive_event("result")["goal"]["reason"] for _ in range(count)])
+        talk.stop()
+        assert reasons.result() == ["shutdown"] * count
+
+
 def test_row_12_feedback_names_its_goal_and_precedes_the_result(scripted: Talk) -> None:
     text = "length=0.2 one two three"
     with scripted.connect() as sender, scripted.connect() as waiter, scripted.connect() as quiet:

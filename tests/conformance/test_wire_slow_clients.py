@@ -26,8 +26,11 @@ if TYPE_CHECKING:
     from tests.conftest import MakeTalk
     from tests.support.processes import Talk
 
-#: A tenth of the server's limits in seconds, and the additional delay on a loaded machine.
-FIRST_REQUEST, LINE, ALIVE_EVERY, LATE = 0.5, 1.0, 0.5, 1.0
+#: The server's limits in seconds, and the additional delay on a loaded machine.
+FIRST_REQUEST = 5.0
+LINE = 10.0
+ALIVE_EVERY = 5.0
+LATE = 1.0
 HELLO = b'{"request": "hello"}\n'
 
 
@@ -151,11 +154,14 @@ def test_unread_lists_use_limited_memory(make_talk: MakeTalk, kind: str) -> None
     assert grown < clients * 0.6, f"{grown:.0f} MiB"
 
 
-def test_slow_clients_are_disconnected_in_time(make_talk: MakeTalk, tmp_path: pathlib.Path) -> None:
+@pytest.mark.parametrize("share", [0.1, pytest.param(1.0, marks=pytest.mark.slow)])
+def test_slow_clients_are_disconnected_in_time(make_talk: MakeTalk, tmp_path: pathlib.Path, share: float) -> None:
+    """All kinds of slow clients at once, for 12 s or a tenth of that. The longest limit is 10 s."""
+    first, line, every = share * FIRST_REQUEST, share * LINE, share * ALIVE_EVERY
     constants = {
-        "connection__FIRST_REQUEST_S": FIRST_REQUEST,
-        "connection__LINE_LIMIT_S": LINE,
-        "subscribers__CLIENT_ALIVE_INTERVAL_S": ALIVE_EVERY,
+        "connection__FIRST_REQUEST_S": first,
+        "connection__LINE_LIMIT_S": line,
+        "subscribers__CLIENT_ALIVE_INTERVAL_S": every,
     }
     talk = make_talk(program=patched_serve(tmp_path, **constants))
     with limits(), contextlib.ExitStack() as stack:
@@ -170,13 +176,13 @@ def test_slow_clients_are_disconnected_in_time(make_talk: MakeTalk, tmp_path: pa
         tls.send(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(range(11, 255)))
         closed: dict[int, float] = {}
         times = stack.enter_context(time_other_client(talk))
-        while time.monotonic() < started_at + 1.2 * LINE or len(closed) < len(raws) - 2:
-            assert time.monotonic() < started_at + LINE + 2 * LATE, "the connections were not closed"
+        while time.monotonic() < started_at + 1.2 * line or len(closed) < len(raws) - 2:
+            assert time.monotonic() < started_at + line + 2 * LATE, "the connections were not closed"
             for raw in dripping:
                 raw.send(b"x")
-            _collect(raws, closed, started_at, 0.1)
+            _collect(raws, closed, started_at, share)
         assert_within(max(times), 1, "status for another client")
-        for limit, clients in ((FIRST_REQUEST, (silent, tls, *dripping[45:])), (LINE, (partial, *dripping_later))):
+        for limit, clients in ((first, (silent, tls, *dripping[45:])), (line, (partial, *dripping_later))):
             for raw in clients:
                 assert closed[id(raw)] >= limit - 0.1
                 assert_within(closed[id(raw)], limit + LATE, "the end of a slow client")
@@ -184,7 +190,7 @@ def test_slow_clients_are_disconnected_in_time(make_talk: MakeTalk, tmp_path: pa
             assert raw.lines[-1]["error"]["code"] == "too_slow"
         assert not {id(idle), id(waiting)} & closed.keys()
         alive = [message for message in waiting.lines if message.get("event") == "alive"]
-        assert 1.2 * LINE // ALIVE_EVERY <= len(alive) <= (time.monotonic() - started_at) / ALIVE_EVERY + 1
+        assert 1.2 * line // every <= len(alive) <= (time.monotonic() - started_at) / every + 1
         assert len(idle.lines) == 2  # no `alive` events, because it does not wait
         idle.send(b'{"seq": 3, "request": "cancel"}\n')  # a connection may be idle forever
         assert idle.receive_lines(4)[-1] == {"seq": 3, "ok": True, "count": 1}
