@@ -244,6 +244,14 @@ def test_a_goodbye_recalls_goals_that_wait_for_room_and_disconnects(shared_robot
         eve.ask("cancel")
 
 
+def test_many_requests_are_answered_late_and_in_their_order(shared_robot: Robot) -> None:
+    with RemoteClient(shared_robot.broker, "mary") as mary:
+        for number in range(230):
+            mary.send({"seq": number, "request": "hello"})
+        mary.reply(229)
+        assert [line["seq"] for line in mary.lines] == [*range(230)]
+
+
 def test_more_than_64_waiting_requests_of_a_client_are_refused(shared_robot: Robot, client: RemoteClient) -> None:
     shared_robot.talk.request("pause")
     for number in range(100):

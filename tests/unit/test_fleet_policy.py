@@ -214,24 +214,23 @@ def test_a_sentence_is_as_old_as_its_token_whatever_the_echo_says(
     assert (isinstance(decision, Refusal) and decision.error.code == "stale") == stale
 
 
-def test_of_each_user_500_messages_at_once_then_100_per_second_and_every_cancel_are_processed() -> None:
+def test_200_messages_of_a_user_are_due_at_once_then_100_per_second_and_every_cancel() -> None:
     rules = connected(NOW)
-    cancel = request({"request": "cancel"})
 
-    def is_dropped(message: Message, user: str, now: float) -> bool:
-        kind = topics.parse_request_topic(message.topic)
-        assert kind
-        decision = rules.decide(message, kind[0], user, now)
-        return isinstance(decision, Ignored) and decision.kind == "flood"
+    def delay(message: Message, user: str = "bob", now: float = NOW) -> float | None:
+        due = rules.due_time(message, topics.parse_request_topic(message.topic)[0], user, now)  # type: ignore[index]
+        return due and max(0.0, due - now)
 
-    assert [is_dropped(request(response=None), "bob", NOW) for _ in range(501)] == [False] * 500 + [True]
-    assert is_dropped(request(b"hi", PLAIN, None), "bob", NOW + 0.9)
-    assert not is_dropped(request(b"", CANCEL, None), "bob", NOW)
-    assert not is_dropped(replace(cancel, response=None), "bob", NOW)
-    assert not is_dropped(request(response=None), "eve", NOW)
-    for later, accepted in ((1, 100), (1, 0), (3, 200), (1000, 500)):
-        found = [is_dropped(request(response=None), "bob", NOW + later) for _ in range(accepted + 1)]
-        assert found == [False] * accepted + [True]
+    assert {delay(request()) for _ in range(201)} == {0.0}
+    delays = [delay(request()) for _ in range(51)]
+    assert delays[:50] == pytest.approx([number / 100 for number in range(1, 51)])
+    assert delays[50] is None
+    assert delay(request(b"hi", PLAIN), now=NOW + 0.005) is None
+    assert delay(request(b"", CANCEL)) == delay(request({"request": "cancel"})) == delay(request(), "eve") == 0.0
+    assert delay(request(), now=NOW + 0.2) == pytest.approx(0.31)
+    assert {delay(request(), now=NOW + 1000) for _ in range(201)} == {0.0}
+    assert {delay(request(), f"user {number}") for number in range(2_000)} == {0.0}
+    assert (delay(request(), now=NOW + 2_000), len(rules._next_due)) == (0.0, 1)
 
 
 # Maximum age

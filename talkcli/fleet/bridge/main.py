@@ -11,6 +11,7 @@ import contextlib
 import random
 import signal
 import time
+from collections import Counter
 from typing import TYPE_CHECKING
 
 from talkcli import __version__
@@ -18,7 +19,15 @@ from talkcli.daemon import log
 from talkcli.daemon.systemd import ServiceManager
 from talkcli.errors import AddressInUse, TalkError
 from talkcli.fleet import topics
-from talkcli.fleet.bridge.policy import ECHO_EVERY_S, STALE_CODE, Goodbye, Ignored, Policy, RemoteRequest
+from talkcli.fleet.bridge.policy import (
+    ECHO_EVERY_S,
+    MAX_MESSAGES_PER_S,
+    STALE_CODE,
+    Goodbye,
+    Ignored,
+    Policy,
+    RemoteRequest,
+)
 from talkcli.fleet.bridge.publisher import Publisher
 from talkcli.fleet.bridge.session import RemoteSessions
 from talkcli.fleet.link import REASON_FAILURE, Link, LinkOpener, boottime, is_denied
@@ -161,6 +170,8 @@ class Bridge:
         self._echo_at = 0.0
         #: when the presence was last published, by the event loop's clock
         self._presence_at = 0.0
+        #: number of delayed messages of each user
+        self._delayed = Counter[str]()
         #: timer for the next description for Home Assistant; None if none is scheduled
         self._device_timer: asyncio.TimerHandle | None = None
         self._ending = asyncio.Event()
@@ -397,7 +408,7 @@ class Bridge:
             log.write_bug("a message from the broker", error)
 
     def _handle_message(self, message: Message) -> None:
-        """React to an echo, a presence message or a client's request from the broker."""
+        """React to an echo or a presence message. Handle, delay or drop a client's request."""
         if message.topic == self._echo_topic:
             self._handle_echo(message.payload)
             return
@@ -410,7 +421,27 @@ class Bridge:
         topic = topics.parse_request_topic(message.topic)
         if topic is None or not self._online:
             return
-        decision = self._policy.decide(message, *topic, boottime())
+        kind, user = topic
+        now = boottime()
+        due = self._policy.due_time(message, kind, user, now)
+        if due is None:
+            words = f"dropped messages of {user}, who sends more than {MAX_MESSAGES_PER_S} per second"
+            log.write_limited("flood", log.sanitize(words))
+        elif due <= now and not self._delayed[user]:
+            self._handle_request(message, kind, user)
+        else:  # Even if the message is due, it must not overtake delayed messages of the same user.
+            self._delayed[user] += 1
+            self._loop.call_later(due - now, self._handle_delayed, message, kind, user)
+
+    def _handle_delayed(self, message: Message, kind: str, user: str) -> None:
+        """Handle a delayed request, unless the connection to the broker has been lost."""
+        self._delayed -= Counter([user])
+        if self._online:
+            self._handle_request(message, kind, user)
+
+    def _handle_request(self, message: Message, kind: str, user: str) -> None:
+        """Carry out a client's request, or refuse or ignore it, as the policy decides."""
+        decision = self._policy.decide(message, kind, user, boottime())
         if isinstance(decision, Ignored):
             log.write_limited(decision.kind, log.sanitize(decision.words))
         elif isinstance(decision, Goodbye):
@@ -421,7 +452,7 @@ class Bridge:
             error = decision.error
             if decision.reply:
                 self._publish(decision.reply)
-            log.write_limited(error.code, f"refused a request of {topic[1]}: {log.sanitize(error.message)}")
+            log.write_limited(error.code, f"refused a request of {user}: {log.sanitize(error.message)}")
             if error.code == STALE_CODE and boottime() - self._echo_at >= _ECHO_PAUSE_S:
                 self._send_echo()
 

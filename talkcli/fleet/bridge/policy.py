@@ -7,7 +7,6 @@ may still be rejected by the server, which makes all decisions about speech. All
 from __future__ import annotations
 
 import contextlib
-from collections import Counter
 from typing import TYPE_CHECKING
 
 from talkcli.errors import BadRequest, LineTooLong, RequestRefused
@@ -42,9 +41,13 @@ STALE_AFTER_S = ECHO_EVERY_S + 1.0
 #: Maximum number of pending goals from remote clients. The server's queue has 100 places by default. The others
 #: are left to local clients.
 MAX_REMOTE_GOALS = 20
-#: Maximum number of messages from one user at once, and per second after that. Further messages are dropped. Otherwise,
-#: the broker's queue for the robot could become full, and the broker would drop messages of all users.
-MAX_BURST_MESSAGES, MAX_MESSAGES_PER_S = 500, 100
+#: Maximum number of messages from one user at once, and per second after that. Further messages are delayed by up to
+#: MAX_DELAY_S, and then dropped. Otherwise, a flood could fill the broker's queue for the robot, and the broker would
+#: drop messages of all users.
+MAX_BURST_MESSAGES, MAX_MESSAGES_PER_S, MAX_DELAY_S = 200, 100, 0.5
+_BURST_S = MAX_BURST_MESSAGES / MAX_MESSAGES_PER_S
+#: Maximum number of users whose messages are counted. Above this, users without recent messages are forgotten.
+_MAX_COUNTED_USERS = 1_000
 #: A user can send another goal if the user has fewer pending goals than this many times the free places. This limits
 #: one user to 15 of the 20 places, so that another user finds at least 5 free.
 _PENDING_PER_FREE_PLACE = 3
@@ -135,8 +138,8 @@ class Policy:
             session: the random id of the bridge process, which is part of its tokens.
         """
         self._session = session
-        #: number of each user's recent messages, and when it was last reduced, by the `boottime` clock
-        self._message_counts, self._reduced_at = Counter[str](), 0.0
+        #: when each user's next message may be processed, by the `boottime` clock
+        self._next_due: dict[str, float] = {}
         self._name = name
         self._allow = {*allow, *ALWAYS_ALLOWED}
         #: when the newest returned echo was sent, or when the connection was opened, by the `boottime` clock
@@ -156,6 +159,21 @@ class Policy:
         """Return a token. Every message with this token must have been sent after `now`."""
         return f"{self._session} {now}"
 
+    def due_time(self, message: Message, kind: str, user: str, now: float) -> float | None:
+        """Count a message. Return when to process it, or None to drop it. A `cancel` is due at once.
+
+        The time is by the `boottime` clock. It is in the past if the user has sent few messages lately.
+        """
+        if kind == topics.PLAIN_CANCEL or b'"cancel"' in message.payload:
+            return now
+        if len(self._next_due) > _MAX_COUNTED_USERS:
+            self._next_due = {each: due for each, due in self._next_due.items() if due > now - _BURST_S}
+        due = max(self._next_due.get(user, 0.0), now - _BURST_S)
+        if due > now + MAX_DELAY_S:
+            return None
+        self._next_due[user] = due + 1 / MAX_MESSAGES_PER_S
+        return due
+
     def decide(self, message: Message, kind: str, user: str, now: float) -> RemoteRequest | Refusal | Goodbye | Ignored:
         """Decide whether to accept, refuse or ignore a message, or to end its client's session.
 
@@ -165,8 +183,6 @@ class Policy:
             user: the client's user name.
             now: the current time, by the `boottime` clock.
         """
-        if self._is_flood(message, kind, user, now):
-            return Ignored("flood", f"dropped messages of {user}, who sends more than {MAX_MESSAGES_PER_S} per second")
         if message.retained:
             return Ignored("retained", f"dropped a retained message on {message.topic}, because it may be old")
         reply_topic = None
@@ -195,17 +211,6 @@ class Policy:
         start_by = None if message.expiry is None else now + message.expiry
         size = 0 if kind == topics.PLAIN_CANCEL else len(message.payload)
         return RemoteRequest(user, reply_topic, seq, request, correlation, size, start_by)
-
-    def _is_flood(self, message: Message, kind: str, user: str, now: float) -> bool:
-        """Count a message. Return True if its user has sent too many messages and it isn't a `cancel`."""
-        passed_s = int(now - self._reduced_at)
-        if passed_s > 0:
-            self._message_counts -= Counter(dict.fromkeys(self._message_counts, passed_s * MAX_MESSAGES_PER_S))
-            self._reduced_at += passed_s
-        if self._message_counts[user] < MAX_BURST_MESSAGES:
-            self._message_counts[user] += 1
-            return False
-        return kind != topics.PLAIN_CANCEL and b'"cancel"' not in message.payload
 
     def _check_request(self, request: Request, token: str | None, now: float) -> None:
         """Raise BadRequest if a request from the broker is not allowed, or if a `say` may be too old."""
