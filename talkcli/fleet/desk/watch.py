@@ -257,7 +257,8 @@ class FleetWatch:
 
     def _check_time_limits(self, now: float) -> None:
         """Report robots that haven't come back in time. Raise Lost if the broker is still away."""
-        if self._away_since is not None and now - self._away_since >= ABSENCE_LIMIT_S:
+        too_long = self._away_since is not None and now - self._away_since >= ABSENCE_LIMIT_S
+        if too_long and not self._events:  # All events must be reported before the watch fails.
             raise Lost(f"the broker at {self._broker.url} was unreachable for {ABSENCE_LIMIT_S:g} s: {self._away_why}")
         for name in [name for name, until in self._missing.items() if now >= until]:
             del self._missing[name]
