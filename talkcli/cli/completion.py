@@ -133,7 +133,7 @@ def _last_word(line: str) -> tuple[str, str]:
 
 
 def _with_flag(value: str, incomplete: str) -> str:
-    """Return `--option=VALUE` if the user is typing in this form. Otherwise, return the value."""
+    """Return the value, or `--option=VALUE` if the user has typed the option with an equals sign."""
     option, equals, _ = incomplete.partition("=")
     return f"{option}={value}" if equals and option.startswith("-") else value
 

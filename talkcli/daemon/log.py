@@ -41,7 +41,7 @@ class RateLimit:
         self._event_count = 0
 
     def count_event(self, now: float) -> int | None:
-        """Count an event. Return None to suppress it, or else the number of events suppressed before it.
+        """Count an event. Return how many earlier events were suppressed, or None to suppress this one too.
 
         Only the events that have been suppressed since the last allowed event are counted.
         """

@@ -150,7 +150,7 @@ def probe_engine(options: EngineOptions) -> EngineReport:
 
 
 def explain_failure(error: EngineFailed) -> tuple[str, str]:
-    """Return the machine-readable reason and the message of an engine's failure.
+    """Return why an engine failed: a machine-readable reason and a message.
 
     The reason is `engine_hung` if the engine stopped responding.
     """

@@ -164,7 +164,7 @@ def _short_names(voice_id: str) -> list[str]:
 
 
 def _find_exact(wanted: str, voices: tuple[Voice, ...], server_voice: str | None = None) -> Voice | None:
-    """Find a voice by its exact name, which may include a speaker or a variant. Ignore case.
+    """Find a voice by its id, name, language or variant, ignoring case. A language prefers `server_voice`.
 
     Return None if there is none. The id of a neural voice may end with "#" and a speaker.
     """

@@ -101,7 +101,7 @@ class Kind:
     wrong_type: str
     #: placeholder for the value in help texts, or an empty string to use the option's name
     metavar: str = ""
-    #: function that checks a value further, and returns an error message or None
+    #: function for additional checks. It returns an error message or None
     check: Callable[[Any], str | None] | None = None
     #: if the value is a duration, its unit: "s" or "ms". The command line also accepts other units, such as 2m.
     time_unit: str = ""
@@ -238,7 +238,7 @@ class Option:
     unit: str = ""
     #: allowed values, if there is a fixed set of them
     choices: tuple[str, ...] = ()
-    #: function that checks a value further, and returns an error message or None
+    #: function for additional checks. It returns an error message or None
     check: Callable[[Any], str | None] | None = None
     #: description of the allowed values in the protocol's document
     form: str = ""

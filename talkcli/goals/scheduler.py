@@ -88,7 +88,7 @@ class PauseChange:
 
 @frozen
 class SpeechPause:
-    """A client's pause of all speech."""
+    """A pause of all speech that a client began."""
 
     client: Sender
     #: the beginning and the end, in seconds since 1970 UTC. The end is None if only `resume` ends the pause.

@@ -416,7 +416,7 @@ class ClientConnection(asyncio.Protocol):
         return True
 
     def _process_line(self, line: bytes) -> None:
-        """Pass a line's request to the handler, or reply with an error.
+        """Pass the request in a line to the handler, or reply with an error.
 
         An urgent request admits the client.
         """

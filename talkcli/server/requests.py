@@ -193,7 +193,7 @@ class Requests:
                 each.resume()
 
     def _select_waiting(self, selection: Cancel) -> list[PendingRequest]:
-        """Return the waiting `say` requests to cancel."""
+        """Return the waiting `say` requests that a `cancel` selects."""
         waiting = (*self._speech.canceled_goals, *self._speech.waiting_for_room, *self._speech.waiting_for_voices)
         goals = [(each, each.request) for each in waiting if isinstance(each.request, Say)]
         selected = (goals[index][0] for index in selection.select_waiting([say for _, say in goals]))

@@ -281,7 +281,7 @@ class Speech:
         return self.pronunciation_file.refresh().terms if self.pronunciation_file else {}
 
     def describe_goal(self, record: Record) -> Goal:
-        """Return a copy of a goal with the text as it is spoken, or as it would be spoken now."""
+        """Return a copy of a goal. Its `said` is the text as it is spoken, or as it would be spoken now."""
         goal, terms = record.snapshot(), record.pronunciations
         if terms is None and goal.state is State.PENDING:
             terms = self._current_pronunciations()
@@ -508,7 +508,7 @@ class Speech:
             self.apply(self.scheduler.engine_unavailable(now))
 
     def _record_engine_failure(self, message: str) -> None:
-        """Record and log why there is no engine, and resume requests that wait for voices."""
+        """Record and log why there is no engine. Requests that wait for its voices continue."""
         if message != self.engine_status:
             log.write(log.sanitize(message))
         self.engine_status = message

@@ -102,7 +102,7 @@ def _decode(data: bytes, file: SoundFile) -> array[int]:
     width = file.sample_bytes
     high_bytes = data[width - 1 :: width]
     if width == 1:
-        high_bytes = bytes(each ^ 0x80 for each in high_bytes)  # only samples of 8 bits are unsigned
+        high_bytes = bytes(each ^ 0x80 for each in high_bytes)  # Only 8-bit samples are unsigned.
     words = bytearray(len(high_bytes) * 2)
     words[1::2] = high_bytes
     if width > 1:

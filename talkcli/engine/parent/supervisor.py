@@ -413,17 +413,17 @@ class Supervisor:
             if goal.sent:
                 self._send(protocol.Append(goal_id, added, complete, broke_off))
 
-    def _pause_or_resume_goal(self, goal_id: str, number: int | None) -> None:
-        """Pause the goal, or resume it if `number` is None."""
+    def _pause_or_resume_goal(self, goal_id: str, hold_number: int | None) -> None:
+        """Pause the goal, or resume it if `hold_number` is None."""
         goal = self._current_goal(goal_id)
-        if goal is None or goal.stop_due != NEVER or goal.end or goal.hold_number == number:
+        if goal is None or goal.stop_due != NEVER or goal.end or goal.hold_number == hold_number:
             return
-        goal.hold_number = number
-        goal.hold_due = time.monotonic() + HOLD_LIMIT_S if goal.sent and number is not None else NEVER
+        goal.hold_number = hold_number
+        goal.hold_due = time.monotonic() + HOLD_LIMIT_S if goal.sent and hold_number is not None else NEVER
         if goal.sent:
-            self._send(protocol.Continue(goal_id) if number is None else protocol.Hold(goal_id, number))
-        elif number is not None:
-            self._post(protocol.Held(goal_id, number))  # the goal is already silent, because no process is speaking it
+            self._send(protocol.Continue(goal_id) if hold_number is None else protocol.Hold(goal_id, hold_number))
+        elif hold_number is not None:
+            self._post(protocol.Held(goal_id, hold_number))  # The goal is silent, because no process speaks it.
         else:
             self._send_waiting_goal()
 

@@ -201,7 +201,7 @@ class Policy:
             fields = _parse_request_fields(kind, message.payload)
             seq = take_seq(fields)
             if not repeatable:
-                raise BadRequest(f"correlation data must have at most {MAX_CORRELATION_BYTES} bytes", "bad_field")
+                raise BadRequest(f"the correlation data is longer than {MAX_CORRELATION_BYTES} bytes", "bad_field")
             request = read_request(fields)
             self._check_request(request, message.token, now)
         except BadRequest as error:

@@ -336,7 +336,7 @@ class FleetRequestCalls:
         self._unfinished.add(name)
 
     def _record_ended_goals(self, name: str, *, fail_if_late: bool = False) -> None:
-        """Record the outcomes of an unfinished robot's goals that have just ended."""
+        """Record the outcomes of a robot's goals that have just ended, unless the robot is finished."""
         if name in self._unfinished:
             self._robots[name].record_ended_goals(fail_if_late=fail_if_late)
 

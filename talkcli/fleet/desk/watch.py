@@ -176,7 +176,7 @@ class FleetWatch:
         self._desk.handler = self
         self._events: deque[FleetEvent] = deque()
         self._presences: dict[str, Presence] = {}
-        #: by robot name: the ids of the last goals that were reported as ended (key True) and as started (key False)
+        #: for each robot, the ids of the last goals that were reported as ended (key True) and as started (key False)
         self._reported: dict[str, dict[bool, str]] = {}
         #: the robots whose events may have been missed. Their next status message shows the goals that were missed.
         self._maybe_missed: set[str] = set()

@@ -166,7 +166,7 @@ class ModelLoader:
             self._start_next_load()
 
     def get_model(self, voice: str) -> Model | None:
-        """Store the result of a finished load. Return the model of a voice, or None if it isn't loaded.
+        """Return the model of a voice, or None if it isn't loaded. First, store the result of a finished load.
 
         If the voice has failed and its files have changed since then, unload it.
         """

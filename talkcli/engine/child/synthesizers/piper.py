@@ -215,7 +215,8 @@ def _speak_parts(
         loudest = 0.0
         quiet = 0  # how many silent samples come after the last sound
         begin, count = 0, _MIN_DECODED_FRAMES
-        # Hold back silence until there is sound. If the whole part is silent, another voice can speak it instead.
+        # Don't play initial silence at once. If the whole part of the text turns out to be silent, another voice can
+        # speak it instead.
         silent: list[SpokenPart] = []
         while begin < frames.count:
             end = min(frames.count, begin + count)

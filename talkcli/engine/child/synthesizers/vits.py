@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     Buffer = bytes | memoryview
     #: a field of a message: its number, its wire type (one of the four below), and its value. Integers stay encoded.
     Field = tuple[int, int, Buffer]
-    #: half of a model, as the parts of a complete ONNX file. The weights are not copied.
+    #: the parts of an ONNX file that contains half of a model. The weights are not copied.
     ModelHalf = tuple[Buffer, ...]
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
