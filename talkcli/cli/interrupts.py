@@ -49,7 +49,7 @@ class Interrupts:
     """A context manager that ends a wait on SIGINT, SIGTERM, SIGHUP or, optionally, closed output.
 
     Pass `watched` to `wait_ready` as `interrupt`. The context manager suppresses the Interrupted exception that ends
-    the wait, and provides the command's `exit_code`. A second signal ends the process at once. A second SIGHUP is
+    the wait, and provides the command's `exit_code`. A second SIGINT or SIGTERM ends the process. A second SIGHUP is
     ignored, because the shell and the system both send one when a terminal is closed.
     """
 

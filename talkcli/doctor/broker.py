@@ -373,7 +373,7 @@ def _advise_on_tls_error(broker: Broker, message: str, verify_code: int, now: fl
 def judge_login(broker: Broker, refusal: str | None) -> Finding:
     """Create the finding for a login. The login succeeded if `refusal` is None.
 
-    `refusal` says why the broker refused the login.
+    Otherwise, `refusal` says why the broker refused it.
     """
     if refusal is not None:
         wrong, _, remedy = refusal.partition("; ")

@@ -152,7 +152,7 @@ def access_rules(
     elif homeassistant:
         lines += [
             "",
-            "# Home Assistant may make each robot speak, cancel sentences, and use all topics under homeassistant/.",
+            "# Home Assistant may send requests to robots, read their messages, and use topics under homeassistant/.",
             f"user {HOMEASSISTANT}",
             *(f"topic write {robot('+', level, HOMEASSISTANT)}" for level in REQUEST_LEVELS),
             f"topic read {robot('+', PRESENCE)}",

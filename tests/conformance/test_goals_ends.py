@@ -12,7 +12,8 @@ from tests.conformance.checks import count_ends, states
 from tests.support.timing import assert_within, limits
 
 if TYPE_CHECKING:
-    from tests.support.connection import Wire
+    from tests.conftest import MakeTalk
+    from tests.support.connection import Message, Wire
     from tests.support.processes import Talk
 
 #: Limit in seconds for the reply to `status` and `cancel`, whatever the engine does.
@@ -120,6 +121,26 @@ def test_row_11_a_cancel_without_an_id_ends_all_goals(scripted: Talk) -> None:
     assert {scripted.goal(goal_id)["reason"] for goal_id in ids} == {"canceled"}
     assert count_ends(scripted, *ids) == [1, 1, 1, 1]
     assert states(scripted, ids[1]) == ["PENDING", "RECALLED"]  # never ACTIVE
+
+
+def test_row_12_feedback_names_its_goal_and_precedes_the_result(make_talk: MakeTalk) -> None:
+    talk = make_talk(scripted=True)
+    texts = [f"length=0.15 this is goal number {number}" for number in range(4)]
+    with talk.connect() as watching, talk.connect() as one, talk.connect() as two:
+        assert watching.request("watch")["ok"]
+        ids = [submit(wire, text) for wire, text in zip((one, two, one, two), texts, strict=True)]
+        talk.watcher.wait_for(ids[-1], "SUCCEEDED")
+        events: list[Message] = [*watching.events]
+        while not events or events[-1].get("id") != ids[-1] or events[-1].get("state") != "SUCCEEDED":
+            events.append(watching.receive())
+    assert [event["n"] for event in events if "n" in event] == list(range(1, 1 + len(events)))  # nothing was dropped
+    for goal_id, text in zip(ids, texts, strict=True):
+        own = [event for event in events if event.get("id") == goal_id]
+        assert [event.get("state") for event in own] == ["PENDING", "ACTIVE", *[None] * 6, "SUCCEEDED"]
+        words = [event for event in own if event["event"] == "word"]
+        assert [word["word"] for word in words] == text.split()
+        assert all(text[word["start"] : word["end"]] == word["word"] for word in words)
+        assert [word["number"] for word in words] == [1, 2, 3, 4, 5, 6]
 
 
 def test_row_14_a_cancel_without_any_goals_succeeds(scripted: Talk) -> None:

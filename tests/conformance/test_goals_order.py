@@ -190,7 +190,7 @@ def test_all_clients_get_their_results_at_shutdown_even_beyond_the_output_limit(
         assert reasons.result() == ["shutdown"] * count
 
 
-def test_row_12_feedback_names_its_goal_and_precedes_the_result(scripted: Talk) -> None:
+def test_subscribers_get_the_words_before_the_result(scripted: Talk) -> None:
     text = "length=0.2 one two three"
     with scripted.connect() as sender, scripted.connect() as waiter, scripted.connect() as quiet:
         other = sender.request("say", text="length=0 not followed", wait=True)["goal"]["id"]

@@ -20,7 +20,8 @@ class Bystanders:
     def __init__(self, talk: Talk) -> None:
         self._talk = talk
         with talk.connect() as wire:
-            self._ids = [wire.request("say", text=f"never-ends {name}")["goal"]["id"] for name in ("active", "pending")]
+            goals = [wire.request("say", text=f"never-ends {key}", key=key)["goal"] for key in ("active", "pending")]
+        self._ids = [goal["id"] for goal in goals]
         talk.watcher.wait_for_word(self._ids[0])
 
     def assert_untouched(self) -> None:
@@ -34,6 +35,17 @@ def assert_rejected(done: Finished, reason: str) -> None:
     goal = json.loads(done.out)
     assert (done.code, goal["state"], goal["reason"]) == (5, "REJECTED", reason), done
     assert "not spoken: " in done.err
+
+
+def test_row_13_a_rejected_text_has_no_other_effect(scripted: Talk) -> None:
+    bystanders = Bystanders(scripted)
+    for option in ("preempt", "flush"):
+        request = {"request": "say", "text": "battery \ud83d low", "key": "pending", option: True}
+        with scripted.connect() as wire:
+            wire.send_raw(json.dumps(request).encode() + b"\n")
+            goal = wire.receive()["goal"]
+        assert (goal["state"], goal["reason"]) == ("REJECTED", "invalid_text")
+        bystanders.assert_untouched()
 
 
 def test_row_13_a_text_that_cannot_be_spoken_is_rejected_by_say(scripted: Talk) -> None:

@@ -86,16 +86,16 @@ def test_row_29_half_the_rate_takes_twice_as_long(make_talk: MakeTalk, sink: Sin
 
 
 def test_row_36_an_expired_goal_is_never_heard(talk: Talk) -> None:
-    long = send(talk, LONG)
-    goal = send(talk, NEVER, ttl=0.4)
+    long = send(talk, LONG, rate=200)
+    goal = send(talk, NEVER, ttl=1)
     after = send(talk, LOW)
     assert_recalled(talk, goal, "expired")
     assert talk.watcher.states(long) == ["PENDING", "ACTIVE"]
     expired = talk.goal(goal)
-    assert expired["ended_at"] - expired["queued_at"] == pytest.approx(0.4, abs=0.1)
-    assert (expired["ttl"], expired["message"].startswith("not spoken: ")) == (0.4, True)
+    assert expired["ended_at"] - expired["queued_at"] == pytest.approx(1, abs=0.1)
+    assert (expired["ttl"], expired["message"].startswith("not spoken: ")) == (1, True)
     await_spoken(talk, long, after)
-    assert_heard(heard(talk), ESPEAK.render([LONG, LOW]))
+    assert_heard(heard(talk), ESPEAK.render([Sentence(LONG, rate=200), LOW]))
 
 
 def test_row_37_a_newer_goal_with_the_same_key_takes_the_old_ones_place(talk: Talk) -> None:
@@ -241,13 +241,13 @@ def test_row_24_a_preempting_goal_is_heard_after_the_old_one_is_silent(make_talk
 
 
 def test_row_25_a_preempting_goal_goes_before_the_queued_ones(talk: Talk) -> None:
-    first, waiting = [send(talk, text) for text in (LONG, LOW)]
+    first, *waiting = [send(talk, text) for text in (LONG, LOW, HELP)]
     await_word(talk, first)
     urgent = talk.run("say", "--preempt", "--wait", "--", HOME)
     assert (urgent.code, urgent.err) == (0, "")
-    await_spoken(talk, waiting)
+    await_spoken(talk, *waiting)
     assert talk.watcher.states(first) == STOPPED
-    stopped.assert_heard_after_stop(heard(talk), LONG, [HOME, LOW])
+    stopped.assert_heard_after_stop(heard(talk), LONG, [HOME, LOW, HELP])
 
 
 def test_row_27_cancel_current_stops_a_goal_and_the_next_is_spoken(talk: Talk) -> None:

@@ -12,8 +12,9 @@ from tests.tools.fuzz_texts import daily_seed
 SECONDS = float(os.environ.get("TALK_TEST_FUZZ") or (30 if os.environ.get("CI") else 8))
 
 
-def test_every_mutated_line_gets_one_reply() -> None:
-    replies = fuzz(20, count=2_000)
+@pytest.mark.parametrize("count", [2_000, pytest.param(20_000, marks=pytest.mark.slow)])
+def test_every_mutated_line_gets_one_reply(count: int) -> None:
+    replies = fuzz(20, count=count)
     assert len(replies) > 8, f"hardly any errors: {replies}"
 
 

@@ -11,7 +11,7 @@ import contextlib
 import random
 import signal
 import time
-from collections import Counter
+from collections import deque
 from typing import TYPE_CHECKING
 
 from talkcli import __version__
@@ -19,6 +19,7 @@ from talkcli.daemon import log
 from talkcli.daemon.systemd import ServiceManager
 from talkcli.errors import AddressInUse, TalkError
 from talkcli.fleet import topics
+from talkcli.fleet.bridge import policy
 from talkcli.fleet.bridge.policy import (
     ECHO_EVERY_S,
     MAX_MESSAGES_PER_S,
@@ -39,6 +40,7 @@ from talkcli.protocol.lines import MAX_LINE_BYTES, encode
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from talkcli.fleet.bridge.policy import Decision
     from talkcli.fleet.broker import Broker
     from talkcli.fleet.link import OnAcknowledged
     from talkcli.goals.goal import Goal
@@ -170,8 +172,8 @@ class Bridge:
         self._echo_at = 0.0
         #: when the presence was last published, by the event loop's clock
         self._presence_at = 0.0
-        #: number of delayed messages of each user
-        self._delayed = Counter[str]()
+        #: delayed decisions on messages, by user, with the time when each is due, by the `boottime` clock
+        self._delayed: dict[str, deque[tuple[float, Decision]]] = {}
         #: timer for the next description for Home Assistant; None if none is scheduled
         self._device_timer: asyncio.TimerHandle | None = None
         self._ending = asyncio.Event()
@@ -321,6 +323,8 @@ class Bridge:
         if self._link is link:
             self._link, self._online = None, False
             self._unwatch_link()
+            for delayed in self._delayed.values():
+                delayed.clear()
             if self._rival_timer:
                 self._rival_timer.cancel()
             self._sessions.end_all()
@@ -408,7 +412,7 @@ class Bridge:
             log.write_bug("a message from the broker", error)
 
     def _handle_message(self, message: Message) -> None:
-        """React to an echo or a presence message. Handle, delay or drop a client's request."""
+        """React to an echo, a presence message or a client's request from the broker."""
         if message.topic == self._echo_topic:
             self._handle_echo(message.payload)
             return
@@ -421,27 +425,41 @@ class Bridge:
         topic = topics.parse_request_topic(message.topic)
         if topic is None or not self._online:
             return
-        kind, user = topic
-        now = boottime()
-        due = self._policy.due_time(message, kind, user, now)
+        self._handle_request(message, *topic)
+
+    def _handle_request(self, message: Message, kind: str, user: str) -> None:
+        """Decide on a client's request. Carry the decision out now, or later if the user sends many messages."""
+        now, is_cancel = boottime(), policy.is_cancel(message, kind)
+        due = now if is_cancel else self._policy.due_time(user, now)
         if due is None:
             words = f"dropped messages of {user}, who sends more than {MAX_MESSAGES_PER_S} per second"
             log.write_limited("flood", log.sanitize(words))
-        elif due <= now and not self._delayed[user]:
-            self._handle_request(message, kind, user)
-        else:  # Even if the message is due, it must not overtake delayed messages of the same user.
-            self._delayed[user] += 1
-            self._loop.call_later(due - now, self._handle_delayed, message, kind, user)
+            return
+        decision = self._policy.decide(message, kind, user, now)
+        delayed = self._delayed.get(user, deque())
+        while is_cancel and delayed:  # A `cancel` also has to end the goals that were sent before it.
+            self._carry_out(delayed.popleft()[1], user)
+        if due <= now and not delayed:
+            self._carry_out(decision, user)
+            return
+        delayed.append((due, decision))
+        if user not in self._delayed:
+            self._delayed[user] = delayed
+            self._loop.call_later(due - now, self._carry_out_delayed, user)
 
-    def _handle_delayed(self, message: Message, kind: str, user: str) -> None:
-        """Handle a delayed request, unless the connection to the broker has been lost."""
-        self._delayed -= Counter([user])
-        if self._online:
-            self._handle_request(message, kind, user)
+    def _carry_out_delayed(self, user: str) -> None:
+        """Carry out the oldest delayed decision on a user's message, if any. Schedule the next one."""
+        delayed = self._delayed[user]
+        _, decision = delayed.popleft() if delayed else (0.0, None)
+        if delayed:
+            self._loop.call_later(delayed[0][0] - boottime(), self._carry_out_delayed, user)
+        else:
+            del self._delayed[user]
+        if decision:
+            self._carry_out(decision, user)
 
-    def _handle_request(self, message: Message, kind: str, user: str) -> None:
-        """Carry out a client's request, or refuse or ignore it, as the policy decides."""
-        decision = self._policy.decide(message, kind, user, boottime())
+    def _carry_out(self, decision: Decision, user: str) -> None:
+        """Pass a client's request to its session, or refuse or ignore it, as the policy decided."""
         if isinstance(decision, Ignored):
             log.write_limited(decision.kind, log.sanitize(decision.words))
         elif isinstance(decision, Goodbye):

@@ -7,6 +7,7 @@ may still be rejected by the server, which makes all decisions about speech. All
 from __future__ import annotations
 
 import contextlib
+import re
 from typing import TYPE_CHECKING
 
 from talkcli.errors import BadRequest, LineTooLong, RequestRefused
@@ -46,8 +47,9 @@ MAX_REMOTE_GOALS = 20
 #: drop messages of all users.
 MAX_BURST_MESSAGES, MAX_MESSAGES_PER_S, MAX_DELAY_S = 200, 100, 0.5
 _BURST_S = MAX_BURST_MESSAGES / MAX_MESSAGES_PER_S
-#: Maximum number of users whose messages are counted. Above this, users without recent messages are forgotten.
-_MAX_COUNTED_USERS = 1_000
+_CANCEL = re.compile(rb'"request"\s*:\s*"cancel"')
+#: Above this number of users, those who have sent no messages lately are forgotten.
+_MANY_USERS = 1_000
 #: A user can send another goal if the user has fewer pending goals than this many times the free places. This limits
 #: one user to 15 of the 20 places, so that another user finds at least 5 free.
 _PENDING_PER_FREE_PLACE = 3
@@ -117,6 +119,9 @@ class Ignored:
     words: str
 
 
+Decision = RemoteRequest | Refusal | Goodbye | Ignored
+
+
 class Policy:
     """Decides which messages to a robot are accepted.
 
@@ -138,7 +143,7 @@ class Policy:
             session: the random id of the bridge process, which is part of its tokens.
         """
         self._session = session
-        #: when each user's next message may be processed, by the `boottime` clock
+        #: when each user's next request may be carried out, by the `boottime` clock
         self._next_due: dict[str, float] = {}
         self._name = name
         self._allow = {*allow, *ALWAYS_ALLOWED}
@@ -159,14 +164,12 @@ class Policy:
         """Return a token. Every message with this token must have been sent after `now`."""
         return f"{self._session} {now}"
 
-    def due_time(self, message: Message, kind: str, user: str, now: float) -> float | None:
-        """Count a message. Return when to process it, or None to drop it. A `cancel` is due at once.
+    def due_time(self, user: str, now: float) -> float | None:
+        """Count a user's message. Return when to carry out its request, or None to drop the message.
 
         The time is by the `boottime` clock. It is in the past if the user has sent few messages lately.
         """
-        if kind == topics.PLAIN_CANCEL or b'"cancel"' in message.payload:
-            return now
-        if len(self._next_due) > _MAX_COUNTED_USERS:
+        if len(self._next_due) > _MANY_USERS:
             self._next_due = {each: due for each, due in self._next_due.items() if due > now - _BURST_S}
         due = max(self._next_due.get(user, 0.0), now - _BURST_S)
         if due > now + MAX_DELAY_S:
@@ -174,7 +177,7 @@ class Policy:
         self._next_due[user] = due + 1 / MAX_MESSAGES_PER_S
         return due
 
-    def decide(self, message: Message, kind: str, user: str, now: float) -> RemoteRequest | Refusal | Goodbye | Ignored:
+    def decide(self, message: Message, kind: str, user: str, now: float) -> Decision:
         """Decide whether to accept, refuse or ignore a message, or to end its client's session.
 
         Args:
@@ -378,6 +381,11 @@ def without_texts(message: JsonObject, hidden: tuple[str, ...] = ("text", "said"
         name: {**each, **dict.fromkeys(hidden)} if isinstance(each, dict) and "text" in each else each
         for name, each in message.items()
     }
+
+
+def is_cancel(message: Message, kind: str) -> bool:
+    """Return whether a message looks like a `cancel`, which is neither delayed nor dropped."""
+    return kind == topics.PLAIN_CANCEL or (kind == topics.REQUEST and bool(_CANCEL.search(message.payload)))
 
 
 def sender_name(user: str, name: str | None = None) -> str:
