@@ -110,10 +110,10 @@ class Screen:
             raise SystemExit(f"the control sequence ESC[{numbers}{letter} is not supported")
 
 
-def record(speed: float) -> list[Frame]:
+def record(pause_factor: float) -> list[Frame]:
     """Run the commands in a terminal. Return the recorded screens.
 
-    At speed 0, there are no pauses.
+    If the factor is 0, there are no pauses.
     """
     with contextlib.ExitStack() as stack:
         place = stack.enter_context(tempfile.TemporaryDirectory(prefix="robot-"))
@@ -124,7 +124,7 @@ def record(speed: float) -> list[Frame]:
             os.execve("/bin/sh", ["sh", "-i"], env)
         stack.callback(_end, shell, terminal)
         fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", ROWS, COLUMNS, 0, 0))
-        return _type(terminal, speed)
+        return _type(terminal, pause_factor)
 
 
 def _environment(place: str) -> dict[str, str]:
@@ -203,15 +203,15 @@ class _Typist:
             self.frames.append(self._screen.frame(time.monotonic() - self._began))
 
 
-def _type(terminal: int, speed: float) -> list[Frame]:
+def _type(terminal: int, pause_factor: float) -> list[Frame]:
     """Type all commands one after another. Return the recorded screens."""
     typist = _Typist(terminal)
     for command in COMMANDS:
         typist.watch_until(PROMPT.__eq__)
-        typist.watch(READ_S * speed)
+        typist.watch(READ_S * pause_factor)
         for key in command:
             typist.press(key)
-            typist.watch(KEY_S * speed)
+            typist.watch(KEY_S * pause_factor)
         typed = f"{PROMPT}{command}"
         typist.watch_until(typed.__eq__)
         typist.press("\n")

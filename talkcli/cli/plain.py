@@ -182,7 +182,7 @@ def _connect_early(parsed: PlainCommand, before_sending: Callable[[], None]) -> 
 
 
 def early_messages(parsed: PlainCommand) -> tuple[JsonObject, JsonObject] | None:
-    """Return a command's hello and request messages if they can be sent early."""
+    """Return a command's hello and its request if they can be sent before most of talk is imported."""
     command, name = parsed.command, sender_name(parsed.given.get("name"))
     request = _early_request(command.name, parsed.given)
     if request is None or len(name or "") > MAX_SENDER_NAME_CHARS:

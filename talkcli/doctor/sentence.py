@@ -109,9 +109,9 @@ class SentenceResult:
 
 
 def speak_by_server(client: Client, text: str, limit: float) -> SentenceResult:
-    """Speak a sentence through the server. Return how it ended.
+    """Speak a sentence through the server, and measure its start. Then measure the stop of a silent one.
 
-    Cancel it after `limit` seconds.
+    Return how the sentence ended. Cancel it after `limit` seconds.
     """
     try:
         asked_at = time.monotonic()

@@ -360,13 +360,13 @@ class Scheduler:
         return result
 
     def append(self, record: Record, addition: Append, now: Now) -> list[Effect]:
-        """Add text to a goal, or mark its text as complete. Return the effects.
+        """Add text to a goal, mark its text as complete, or end the goal if its sender gave up.
 
-        An addition that was sent before changes nothing.
+        Return the effects. An addition that was sent before changes nothing.
 
         Args:
             record: the goal.
-            addition: the text to add, and whether it is the last one.
+            addition: the text to add, whether it is the last one, and whether the sender gave up.
             now: the current time.
 
         Raises:
@@ -832,7 +832,7 @@ class Scheduler:
         return say.flush or bool(preempt)
 
     def _find_room(self, say: Say) -> list[tuple[Record, Reason]] | None:
-        """Return the goals that a new goal removes from the queue, or None if there is no room for it.
+        """Return the goals that a new goal would replace, preempt or displace, or None if there is no room.
 
         Each comes with the reason for its removal.
         """

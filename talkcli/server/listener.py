@@ -236,7 +236,7 @@ def _refuse_live_socket(path: str) -> None:
             pass  # a program listens, but its backlog is full
         except OSError:
             return
-    raise AddressInUse(f"another program now listens at {path}")
+    raise AddressInUse(f"another program is now listening at {path}")
 
 
 def _prepare_directory(directory: str) -> None:

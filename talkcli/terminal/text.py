@@ -162,7 +162,7 @@ def longest_fitting(forms: Sequence[str], columns: int | None) -> str:
 
 
 def room_beside(text: str, columns: int, screen: Screen) -> int:
-    """Return how many columns are available for the details beside a text.
+    """Return how many of the columns the details beside a text may take.
 
     The details leave at least half of the line to the text, or 16 columns if whole ids are shown.
     """

@@ -185,7 +185,7 @@ def test_a_socket_that_another_program_puts_there_is_left_intact(home: str) -> N
         other.bind(f"{path}new")
         other.listen()
         os.rename(f"{path}new", path)
-        assert_exits_with_11(server, f"another program now listens at {path}")
+        assert_exits_with_11(server, f"another program is now listening at {path}")
         with socket.socket(socket.AF_UNIX) as client:
             client.connect(path)
 

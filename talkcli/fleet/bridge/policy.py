@@ -104,7 +104,7 @@ class Refusal:
 
 @frozen
 class Goodbye:
-    """A message that ends a client's session."""
+    """A client's message that ends its session."""
 
     user: str
     reply_topic: str

@@ -202,9 +202,10 @@ class RobotConnection(Connection):
         return self._publish(exchange)
 
     def _publish(self, exchange: Exchange) -> bool:
-        """Send a request, unless the robot is absent or a new token is needed. Return whether it was sent.
+        """Send a request now, or queue it until a new token arrives. Return whether it was sent.
 
-        If a `say` needs a new token, it is sent later. Requests after it wait, too, so that they arrive in order.
+        If the robot is absent, do nothing. If a `say` needs a new token, the requests after it wait, too, so that they
+        arrive in order.
         """
         if self.ended is not None or self.absent_since is not None:
             return False
