@@ -87,6 +87,12 @@ def test_a_full_file_keeps_its_size_and_the_newest_goals(
             assert len(ids) >= min(first + 20, 40)
 
 
+def test_a_file_that_is_being_created_has_no_goals(path: str) -> None:
+    os.makedirs(os.path.dirname(path))
+    with open(path, "xb"):
+        assert stored(path) == []
+
+
 def test_a_removed_file_is_created_again(path: str, writer: HistoryWriter) -> None:
     writer.write([goal(1)])
     os.unlink(path)  # its WAL and its index of the WAL stay

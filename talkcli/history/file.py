@@ -181,7 +181,7 @@ class HistoryWriter:
 
 
 def search(path: str, condition: str, values: Sequence[object], count: int, deadline: float) -> list[Row]:
-    """Return the newest rows that fulfil an SQL condition, oldest first. A missing file has no rows.
+    """Return the newest rows that fulfil an SQL condition, oldest first. A missing or new file has no rows.
 
     Args:
         path: the file.
@@ -205,6 +205,8 @@ def search(path: str, condition: str, values: Sequence[object], count: int, dead
         except sqlite3.Error as error:
             if time.monotonic() > deadline:
                 raise HistoryError(TimeoutError("the search took too long"), file) from error
+            if mode == "mode=ro" and "no such table" in str(error):
+                return []  # The server has created the file, but has written nothing yet.
             if mode == "immutable=1" or type(error) is sqlite3.DatabaseError or "locked" in str(error):
                 raise HistoryError(error, file) from error
     return []
