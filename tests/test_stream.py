@@ -300,19 +300,15 @@ async def test_connections_are_accepted_when_a_descriptor_is_free_again(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(stream, "ACCEPT_RETRY_S", 0.01)
-    accepted: list[socket.socket] = []
+    accepted: asyncio.Queue[socket.socket] = asyncio.Queue()
     with FullSocket(socket.AF_UNIX) as listening, socket.socket(socket.AF_UNIX) as client:
         listening.bind(str(tmp_path / "s"))
         listening.listen()
         listening.setblocking(False)
         client.connect(str(tmp_path / "s"))
-        acceptor = Acceptor(accepted.append, 10_000)
+        acceptor = Acceptor(accepted.put_nowait, 10_000)
         acceptor.open(listening)
         await turn()
-        assert (listening.failures, accepted) == (0, [])
-        for _ in range(1_000):
-            if accepted:
-                break
-            await asyncio.sleep(0.01)
+        assert (listening.failures, accepted.qsize()) == (0, 0)
+        (await asyncio.wait_for(accepted.get(), 10)).close()
         acceptor.close()
-        accepted[0].close()

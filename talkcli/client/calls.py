@@ -81,7 +81,7 @@ class ClientCalls(ConnectedClient):
         before: str | None = None,
         key: str | None = None,
     ) -> Canceled:
-        """Cancel goals, and wait until they have stopped. Return these goals, and those that had already ended."""
+        """Cancel goals, and wait until they have stopped. Return these goals and the ones that had ended before."""
         wanted = None if ids is None else [self._full_id(each) for each in ids]
         first, *others = [None] if wanted is None else batches(wanted) or [()]
         last = None if before is None else self._full_id(before)

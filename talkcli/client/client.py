@@ -266,7 +266,7 @@ class Client(ConnectedClient):
         before: str | None = None,
         key: str | None = None,
     ) -> Canceled:
-        """Cancel goals, and wait until they have stopped. Return these goals, and those that had already ended.
+        """Cancel goals, and wait until they have stopped. Return these goals and the ones that had ended before.
 
         Without arguments, cancel all goals. A goal is cancelled if any of the arguments selects it.
 

@@ -307,7 +307,7 @@ def unreachable_error(attempt: ConnectionAttempt, named_path: str | None) -> Tal
         path = attempt.failures[-1][0]
         return ServerUnavailable(f"the server at {path} doesn't accept connections; restart it if it hangs")
     tried = ""
-    found = ""  # what was found at the last path
+    found = ""  # the problem with the last path
     advice = ""  # how to get access to the last path that refused this user
     for path, error in attempt.failures:
         words = str(error)

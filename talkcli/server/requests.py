@@ -169,7 +169,7 @@ class Requests:
         return False
 
     def _schedule_room_check(self) -> None:
-        """If goals wait for room in the queue, schedule a call that submits those that fit."""
+        """If goals wait for room in the queue, schedule a call that submits the goals that fit."""
         if self._speech.waiting_for_room and self._room_check is None:
             # Check in the next iteration of the event loop, because the caller may not have finished its changes.
             self._room_check = asyncio.get_running_loop().call_soon(self._submit_waiting_goals)

@@ -142,7 +142,7 @@ pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="ne
 
 HOUR = 3600
 #: Allowed delay of a timer in seconds, on a busy machine.
-LATE = 1.5
+LATE = 1.0
 #: Python runs this when it starts.
 SITE_CUSTOMIZE = """
 import time

@@ -19,7 +19,6 @@ from talkcli.daemon import log
 from talkcli.daemon.systemd import ServiceManager
 from talkcli.errors import AddressInUse, TalkError
 from talkcli.fleet import topics
-from talkcli.fleet.bridge import policy
 from talkcli.fleet.bridge.policy import (
     ECHO_EVERY_S,
     MAX_MESSAGES_PER_S,
@@ -28,6 +27,7 @@ from talkcli.fleet.bridge.policy import (
     Ignored,
     Policy,
     RemoteRequest,
+    is_cancel,
 )
 from talkcli.fleet.bridge.publisher import Publisher
 from talkcli.fleet.bridge.session import RemoteSessions
@@ -429,15 +429,15 @@ class Bridge:
 
     def _handle_request(self, message: Message, kind: str, user: str) -> None:
         """Decide on a client's request. Carry the decision out now, or later if the user sends many messages."""
-        now, is_cancel = boottime(), policy.is_cancel(message, kind)
-        due = now if is_cancel else self._policy.due_time(user, now)
+        now, cancels = boottime(), is_cancel(message, kind)
+        due = now if cancels else self._policy.due_time(user, now)
         if due is None:
             words = f"dropped messages of {user}, who sends more than {MAX_MESSAGES_PER_S} per second"
             log.write_limited("flood", log.sanitize(words))
             return
         decision = self._policy.decide(message, kind, user, now)
         delayed = self._delayed.get(user, deque())
-        while is_cancel and delayed:  # A `cancel` also has to end the goals that were sent before it.
+        while cancels and delayed:  # A `cancel` also has to end the goals that were sent before it.
             self._carry_out(delayed.popleft()[1], user)
         if due <= now and not delayed:
             self._carry_out(decision, user)

@@ -47,6 +47,7 @@ MAX_REMOTE_GOALS = 20
 #: drop messages of all users.
 MAX_BURST_MESSAGES, MAX_MESSAGES_PER_S, MAX_DELAY_S = 200, 100, 0.5
 _BURST_S = MAX_BURST_MESSAGES / MAX_MESSAGES_PER_S
+#: A request with this field is treated as a `cancel` before it is parsed.
 _CANCEL = re.compile(rb'"request"\s*:\s*"cancel"')
 #: Above this number of users, those who have sent no messages lately are forgotten.
 _MANY_USERS = 1_000
